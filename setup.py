@@ -8,8 +8,8 @@ from setuptools import find_packages, setup
 NAME = "sph_ros"
 SHARED_FOLDERS = ("scenes", "launch", "rviz")
 
-# Jazzy's rclpy from PyPI, for machines without an apt-installed ROS. Never in install_requires: on a
-# ROS machine these come from apt, and the names ros-<package> are shared among ROS releases.
+# Jazzy's rclpy from PyPI, for machines without an apt-installed ROS. Never in install_requires: on
+# a ROS machine these come from apt, and the names ros-<package> are shared among ROS releases.
 ROS_WHEELS = [
     f"{wheel}; sys_platform == 'linux' and platform_machine == 'x86_64'"
     for wheel in (
@@ -35,7 +35,7 @@ def shared_files():
 setup(
     name=NAME,
     version="0.1.0",
-    description="A real-time particle liquid for ROS 2: stirred, poured and pushed by pose messages.",
+    description="A real-time particle liquid for ROS 2, stirred and poured by pose messages.",
     long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     author="The sph_ros authors",

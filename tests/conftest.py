@@ -1,9 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures that several test modules share."""
 
+import os
+import tempfile
 from pathlib import Path
 
 import pytest
+
+# Before any test imports rclpy or matplotlib: stay on this machine, log to a temporary folder,
+# draw without a screen. Child processes inherit all three.
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="sph_ros_log_"))
+os.environ.setdefault("MPLBACKEND", "Agg")
 
 
 @pytest.fixture(scope="session")

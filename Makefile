@@ -1,0 +1,67 @@
+# Everything runs in .venv, which each target makes for itself. Needs Python 3.11 or 3.12 and make.
+#   make demo [ARGS="..."]   make test   make bench   make pictures   make venv   make clean
+
+SHELL := /bin/sh
+VENV := .venv
+READY := $(VENV)/.ready
+BIN := $(VENV)/bin
+
+# The wheels of rclpy in .venv must not meet the libraries of a sourced /opt/ros, nor those of the
+# environment that started make.
+ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
+unexport LD_LIBRARY_PATH
+endif
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
+unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE VIRTUAL_ENV
+
+.PHONY: venv demo test bench pictures clean
+
+venv: $(READY)
+
+# A venv that is broken or was moved is made anew; a sound one is only brought up to date.
+$(READY): setup.py constraints.txt Makefile
+	@if ! [ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ] \
+	    || ! head -1 $(BIN)/pip 2>/dev/null | grep -qF "$(CURDIR)/$(VENV)/"; then \
+	  python=; \
+	  for candidate in $(PYTHON) python3.12 python3.11 python3; do \
+	    if $$candidate -c 'import ensurepip, sys, venv; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' \
+	        2>/dev/null; then python=$$candidate; break; fi; \
+	  done; \
+	  if [ -z "$$python" ]; then \
+	    echo "sph_ros needs Python 3.11 or 3.12 with its venv module, and found none. On Debian or" >&2; \
+	    echo "Ubuntu: sudo apt install python3-venv. One elsewhere: make venv PYTHON=/path/to/python3" >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "making $(VENV) with $$($$python --version)"; \
+	  rm -rf $(VENV); $$python -m venv $(VENV) || exit 1; \
+	fi
+	@echo "installing into $(VENV): one to three minutes, about 1.5 GB"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  --constraint constraints.txt --editable '.[ros,test]'
+	@touch $@
+
+demo: $(READY)
+	@exec $(BIN)/sph_ros demo $(ARGS)
+
+# First what fails quickly, last the whole suite. Without JIT the kernels run as plain Python: their
+# indices are checked and coverage tools see into them.
+test: $(READY)
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -m nojit
+	$(BIN)/python -m pytest -q $(ARGS)
+
+bench: $(READY)
+	@for script in benchmarks/benchmark_*.py; do \
+	  echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit 1; \
+	done
+
+# Last picture and video of each scene, in out/.
+pictures: $(READY)
+	$(BIN)/sph_ros simulate ball_tank --bag hand_stir --out out/ball_tank --force
+	$(BIN)/sph_ros simulate dam_break --seconds 0.6 --out out/dam_break --force
+	$(BIN)/sph_ros simulate drop_box --seconds 1 --out out/drop_box --force
+
+clean:
+	rm -rf $(VENV) build install log out *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
