@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Filling the liquid of a scene with particles, and what can be wrong with it."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sph_ros.core.distances import signed_distances
+from sph_ros.sim.packing import rotation_matrix
+from sph_ros.sim.shapes import Box, Capsule, Cylinder, Pose, Sphere, pack_shapes
+
+#: Memory that a particle takes in all arrays of a simulation together, rounded up [bytes].
+BYTES_PER_PARTICLE = 1000
+
+# Where blocks overlap, a later block keeps only particles at least this far from earlier ones, in
+# spacings: closer pairs would fly apart in the first step.
+_NEAREST = 0.75
+
+
+def fill_liquid(scene):
+    """Particles of all liquid blocks: a cubic lattice in each block's own frame.
+
+    The lattice is centred in the block and starts at least half a spacing from its faces; round
+    shapes take the lattice points inside. A later block leaves out what an earlier one holds. The
+    order is fixed: block by block, within a block x fastest, then y, then z.
+
+    Args:
+        scene: a Scene.
+
+    Returns:
+        (positions, velocities): (N, 3) float32 [m] and [m/s], scene's frame; in 2D y is 0.
+    """
+    positions, velocities = np.zeros((0, 3)), np.zeros((0, 3))
+    for index, block in enumerate(scene.liquid):
+        points = _to_scene(_lattice(block.shape, scene), block.pose)
+        if scene.dimension == 2:
+            points[:, 1] = 0.0
+        points = points[_is_new(points, positions, scene, index)]
+        positions = np.concatenate([positions, points])
+        velocity = np.array(block.velocity)
+        if scene.dimension == 2:
+            velocity[1] = 0.0
+        velocities = np.concatenate([velocities, np.broadcast_to(velocity, points.shape)])
+    return np.ascontiguousarray(positions, np.float32), velocities.astype(np.float32)
+
+
+def distances_to(shape, pose, points, scene):
+    """Signed distance of points to a placed shape [m], negative inside the material.
+
+    Args:
+        shape, pose: the shape and where its frame is in the scene's frame.
+        points: scene's frame [m], (N, 3).
+        scene: for spacing, support radius and dimension.
+
+    Returns:
+        (N,) float32.
+    """
+    packed = pack_shapes([shape], scene.support_radius, scene.spacing, scene.dimension)
+    local = np.ascontiguousarray(
+        (points - pose.position) @ rotation_matrix(pose.quat_xyzw), np.float32
+    )
+    distance = np.empty(len(local), np.float32)
+    signed_distances(packed, 0, local, distance)
+    return distance
+
+
+def bounds(shape):
+    """(lower, upper) corner of a liquid shape in its own frame [m]."""
+    if isinstance(shape, Box):
+        return np.array(shape.min), np.array(shape.max)
+    half = {
+        Sphere: lambda s: (s.radius, s.radius, s.radius),
+        Cylinder: lambda s: (s.radius, s.radius, 0.5 * s.length),
+        Capsule: lambda s: (s.radius, s.radius, s.radius + 0.5 * s.length),
+    }[type(shape)](shape)
+    return -np.array(half), np.array(half)
+
+
+def lattice_counts(shape, scene):
+    """Lattice points along x, y, z that the bounding box of a liquid shape holds, as floats."""
+    lower, upper = bounds(shape)
+    counts = np.floor((upper - lower) / scene.spacing + 1e-6)
+    if scene.dimension == 2:
+        counts[1] = 1.0
+    return counts
+
+
+def estimated_particle_count(scene):
+    """Particles of the scene without making them, an upper bound; float, for it may be huge."""
+    blocks = sum(float(np.prod(lattice_counts(block.shape, scene))) for block in scene.liquid)
+    return blocks + sum(float(emitter.limit or 0) for emitter in scene.emitters)
+
+
+def available_memory():
+    """Memory that a new program can have [bytes], of the machine or of the container it is in."""
+    limits = []
+    try:
+        text = Path("/proc/meminfo").read_text()
+        limits.append(1024 * int(text.split("MemAvailable:")[1].split()[0]))
+        group = Path("/sys/fs/cgroup")
+        used = int((group / "memory.current").read_text())
+        limits.append(int((group / "memory.max").read_text()) - used)
+    except (OSError, IndexError, ValueError):  # not Linux, or no limit on the container
+        pass
+    return min(limits, default=os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+
+
+def _lattice(shape, scene):
+    """Lattice points inside a liquid shape, its own frame, (N, 3) float64."""
+    lower, upper = bounds(shape)
+    counts = lattice_counts(shape, scene).astype(int)
+    start = 0.5 * (lower + upper) - 0.5 * (counts - 1) * scene.spacing
+    axes = [first + scene.spacing * np.arange(n) for first, n in zip(start, counts, strict=True)]
+    if scene.dimension == 2:
+        axes[1] = np.zeros(1)
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    if isinstance(shape, Box):
+        return points
+    return points[distances_to(shape, Pose(), points, scene) <= 0.0]
+
+
+def _is_new(points, earlier, scene, index):
+    """Which points lie in none of the first `index` blocks, nor next to a particle of these."""
+    new = np.ones(len(points), bool)
+    for block in scene.liquid[:index]:
+        new &= distances_to(block.shape, block.pose, points, scene) > 0.0
+    if len(earlier) and len(points):
+        distance, _ = cKDTree(earlier).query(points, distance_upper_bound=scene.spacing)
+        new &= distance > _NEAREST * scene.spacing
+    return new
+
+
+def _to_scene(points, pose):
+    return points @ rotation_matrix(pose.quat_xyzw).T + pose.position

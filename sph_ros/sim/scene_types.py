@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene consists of: frozen dataclasses whose fields are the keys of a scene file.
+
+SI units, z up. Every one checks its own values and raises ValueError("field: what is wrong").
+"""
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass, field
+
+from sph_ros.sim.materials import Material
+from sph_ros.sim.shapes import Box, Capsule, Cylinder, Pose, Shape, Sphere
+
+Vector = tuple[float, float, float]
+
+#: Solvers that exist, and those that are announced but cannot be chosen yet.
+SOLVERS = ("relaxation",)
+PLANNED_SOLVERS = ("forces", "incompressible")
+
+#: Who moves a solid.
+CONTROLS = ("fixed", "topic", "path")
+PLANNED_CONTROLS = ("free",)
+
+LIQUID_SHAPES = (Box, Sphere, Cylinder, Capsule)
+
+_TOPIC_TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+def quantity(unit, default=dataclasses.MISSING, *, low=-math.inf, high=math.inf, above=None):
+    """A field that holds a number, or a vector as long as its default or as `Vector`.
+
+    Args:
+        unit: of the number, for messages; "1" if it has none.
+        default: None makes the field optional.
+        low, high: accepted, both included.
+        above: lower bound that is not included.
+    """
+    limits = {"unit": unit, "low": low, "high": high, "above": above}
+    return field(default=default, metadata=limits)
+
+
+def _check_quantities(instance):
+    """Turn every quantity into float or a tuple of floats, or refuse it."""
+    for item in dataclasses.fields(instance):
+        value = getattr(instance, item.name)
+        if "unit" not in item.metadata or (value is None and item.default is None):
+            continue
+        if item.type in (Vector, Vector | None):
+            value = _vector(item, value)
+        else:
+            value = _number(item.name, value, item.metadata)
+        object.__setattr__(instance, item.name, value)
+
+
+def _vector(item, value):
+    if isinstance(value, (str, dict)) or not hasattr(value, "__len__") or len(value) != 3:
+        raise ValueError(f"{item.name}: expected 3 numbers (x, y, z), got {value!r}")
+    return tuple(_number(f"{item.name}[{i}]", v, item.metadata) for i, v in enumerate(value))
+
+
+def _number(name, value, limits):
+    unit = "" if limits["unit"] == "1" else f" [{limits['unit']}]"
+    if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
+        raise ValueError(f"{name}: expected a number{unit}, got {value!r}")
+    number = float(value)
+    if math.isnan(number) or (math.isinf(number) and not math.isinf(limits["high"])):
+        raise ValueError(f"{name}: expected a finite number{unit}, got {value!r}")
+    if limits["above"] is not None and not number > limits["above"]:
+        raise ValueError(f"{name}: expected more than {limits['above']:g}{unit}, got {number:g}")
+    if not limits["low"] <= number <= limits["high"]:
+        low, high = limits["low"], limits["high"]
+        wanted = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
+        raise ValueError(f"{name}: expected {wanted}{unit}, got {number:g}")
+    return number
+
+
+@dataclass(frozen=True)
+class LiquidBlock:
+    """A piece of liquid at the start.
+
+    Attributes:
+        shape: what is filled; its own frame.
+        pose: of the shape's frame in the scene's frame.
+        velocity: of every particle [m/s], scene's frame.
+    """
+
+    shape: Shape
+    pose: Pose = Pose()
+    velocity: Vector = quantity("m/s", (0.0, 0.0, 0.0), low=-100.0, high=100.0)
+
+    def __post_init__(self):
+        """Refuse shapes that hold no definite amount of liquid."""
+        if not isinstance(self.shape, LIQUID_SHAPES):
+            known = ", ".join(shape.__name__.lower() for shape in LIQUID_SHAPES)
+            raise ValueError(f"shape: liquid can be a {known}; got {self.shape!r}")
+        _check_quantities(self)
+
+
+@dataclass(frozen=True)
+class Emitter:
+    """A round opening that liquid comes out of.
+
+    Attributes:
+        position: centre of the opening [m], scene's frame.
+        direction: of the jet, normalised on construction.
+        radius: of the opening [m].
+        speed: of the liquid [m/s]; follows from `rate` unless given.
+        rate: particles per second; follows from `speed` unless given.
+        from_time: first moment [s]; key `from` in the file.
+        until: last moment [s].
+        limit: most particles it ever emits, None for no limit.
+    """
+
+    position: Vector = quantity("m", low=-1e4, high=1e4)
+    direction: Vector = quantity("1", (0.0, 0.0, -1.0), low=-1e9, high=1e9)
+    radius: float = quantity("m", 0.01, above=0.0, high=100.0)
+    speed: float | None = quantity("m/s", None, above=0.0, high=100.0)
+    rate: float | None = quantity("particles/s", None, above=0.0, high=1e7)
+    from_time: float = quantity("s", 0.0, low=0.0, high=1e9)
+    until: float = quantity("s", math.inf, low=0.0)
+    limit: int | None = quantity("particles", None, low=1, high=1e9)
+
+    def __post_init__(self):
+        """Refuse a jet without direction or strength, and one that never runs."""
+        _check_quantities(self)
+        norm = math.sqrt(sum(v * v for v in self.direction))
+        if norm < 1e-9:
+            raise ValueError(f"direction: expected a length above 0, got {list(self.direction)}")
+        object.__setattr__(self, "direction", tuple(v / norm for v in self.direction))
+        if self.speed is None and self.rate is None:
+            raise ValueError("speed: expected a speed [m/s] or a rate [particles/s], got neither")
+        if self.until <= self.from_time:
+            raise ValueError(
+                f"until: expected more than from ({self.from_time:g} s), got {self.until:g}"
+            )
+        if self.limit is not None:
+            object.__setattr__(self, "limit", int(self.limit))
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where a solid with `control: path` is at a time; between keyframes it sweeps.
+
+    Attributes:
+        time: since the start [s].
+        position: [m], scene's frame.
+        quat_xyzw: orientation, normalised on construction.
+    """
+
+    time: float = quantity("s", low=0.0, high=1e9)
+    position: Vector = quantity("m", low=-1e4, high=1e4)
+    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self):
+        """Check the numbers; Pose knows what a quaternion is."""
+        _check_quantities(self)
+        pose = Pose(self.position, self.quat_xyzw)
+        object.__setattr__(self, "quat_xyzw", pose.quat_xyzw)
+
+
+@dataclass(frozen=True)
+class SolidSpec:
+    """A solid of the scene.
+
+    Attributes:
+        name: unique; part of topic names.
+        shape: in the solid's own frame.
+        pose: of the solid's frame in the scene's frame, at the start.
+        control: "fixed", "topic" (pose messages, mouse, move_solid) or "path" (keyframes).
+        path: keyframes, for control "path".
+        density: mass per volume [kg/m^3], for bodies that float.
+        color: red, green, blue, 0 to 1; chosen by whoever draws unless given.
+        visible: drawn or not; it acts on the liquid either way.
+    """
+
+    name: str
+    shape: Shape
+    pose: Pose = Pose()
+    control: str = "fixed"
+    path: tuple[Keyframe, ...] = ()
+    density: float | None = quantity("kg/m^3", None, above=0.0, high=1e5)
+    color: Vector | None = quantity("1", None, low=0.0, high=1.0)
+    visible: bool = True
+
+    def __post_init__(self):
+        """Refuse bad names, and keyframes that do not fit the control."""
+        if not isinstance(self.name, str) or not _TOPIC_TOKEN.fullmatch(self.name):
+            raise ValueError(
+                "name: expected a letter, then letters, digits or _ (it becomes part of a topic), "
+                f"got {self.name!r}"
+            )
+        if self.control in PLANNED_CONTROLS:
+            raise ValueError(f"control: {self.control!r} is not available yet; {CONTROLS} are")
+        if self.control not in CONTROLS:
+            raise ValueError(f"control: expected one of {CONTROLS}, got {self.control!r}")
+        if not isinstance(self.visible, bool):
+            raise ValueError(f"visible: expected true or false, got {self.visible!r}")
+        _check_quantities(self)
+        self._check_path()
+
+    def _check_path(self):
+        times = [keyframe.time for keyframe in self.path]
+        if self.control == "path" and not times:
+            raise ValueError("path: expected keyframes, because control is path; got none")
+        if times and self.control != "path":
+            raise ValueError(f"path: keyframes need `control: path`, got control {self.control!r}")
+        for index, (earlier, later) in enumerate(zip(times, times[1:], strict=False)):
+            if later <= earlier:
+                raise ValueError(
+                    f"path[{index + 1}].time: expected more than {earlier:g} s, got {later:g}"
+                )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a simulation starts from.
+
+    Attributes:
+        name: of the scene.
+        spacing: of the particles [m].
+        material: the liquid.
+        frame: the frame that all positions are in; header.frame_id of the messages.
+        dimension: 3, or 2: the liquid lives in the x-z plane.
+        support_radius: radius of interaction [m]; None: twice the spacing.
+        solver: one of SOLVERS.
+        gravity: [m/s^2].
+        time_step: [s]; None: chosen by the solver so that it is stable.
+        liquid: at the start.
+        emitters: of more liquid, later.
+        solids: in the order of the file.
+        max_solid_speed: solids sweep towards their poses no faster than this [m/s].
+        source: file the scene came from, or "<dict>".
+        description: for people.
+    """
+
+    name: str
+    spacing: float = quantity("m", above=0.0, high=100.0)
+    material: Material = Material()
+    frame: str = "world"
+    dimension: int = 3
+    support_radius: float | None = quantity("m", None, above=0.0, high=400.0)
+    solver: str = "relaxation"
+    gravity: Vector = quantity("m/s^2", (0.0, 0.0, -9.81), low=-1000.0, high=1000.0)
+    time_step: float | None = quantity("s", None, above=0.0, high=0.1)
+    liquid: tuple[LiquidBlock, ...] = ()
+    emitters: tuple[Emitter, ...] = ()
+    solids: tuple[SolidSpec, ...] = ()
+    max_solid_speed: float = quantity("m/s", 3.0, above=0.0, high=100.0)
+    source: str = "<dict>"
+    description: str = ""
+
+    def __post_init__(self):
+        """Refuse what does not fit together."""
+        _check_quantities(self)
+        self._check_words()
+        if self.support_radius is None:
+            object.__setattr__(self, "support_radius", 2.0 * self.spacing)
+        low, high = 1.2 * self.spacing, 4.0 * self.spacing
+        if not low <= self.support_radius <= high:
+            raise ValueError(
+                f"support_radius: expected {low:g} to {high:g} m (1.2 to 4 spacings), "
+                f"got {self.support_radius:g}"
+            )
+        if not self.liquid and not self.emitters:
+            raise ValueError("liquid: expected liquid or emitters, got neither")
+        self._check_names()
+
+    def _check_words(self):
+        if self.solver in PLANNED_SOLVERS:
+            raise ValueError(f"solver: {self.solver!r} is not available yet; {SOLVERS} are")
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
+        if isinstance(self.dimension, bool) or self.dimension not in (2, 3):
+            raise ValueError(f"dimension: expected 2 or 3, got {self.dimension!r}")
+        for key in ("name", "frame", "description"):
+            if not isinstance(getattr(self, key), str):
+                raise ValueError(f"{key}: expected text, got {getattr(self, key)!r}")
+        if not self.frame or self.frame.startswith("/") or " " in self.frame:
+            raise ValueError(f"frame: expected a frame id without / in front, got {self.frame!r}")
+
+    def _check_names(self):
+        seen = set()
+        for index, solid in enumerate(self.solids):
+            if solid.name in seen:
+                raise ValueError(f"solids[{index}].name: {solid.name!r} is the name of two solids")
+            seen.add(solid.name)
