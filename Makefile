@@ -18,6 +18,12 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE VIRTUAL_ENV
 
 venv: $(READY)
 
+# The stamp holds the folder it was made in: a venv does not survive being moved.
+ifneq ($(shell cat $(READY) 2>/dev/null),$(CURDIR))
+$(READY): again
+endif
+.PHONY: again
+
 # A venv that is broken or was moved is made anew; a sound one is only brought up to date.
 $(READY): setup.py constraints.txt Makefile
 	@if ! [ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ] \
@@ -38,7 +44,7 @@ $(READY): setup.py constraints.txt Makefile
 	@echo "installing into $(VENV): one to three minutes, about 1.5 GB"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	  --constraint constraints.txt --editable '.[ros,test]'
-	@touch $@
+	@echo "$(CURDIR)" > $@
 
 demo: $(READY)
 	@exec $(BIN)/sph_ros demo $(ARGS)

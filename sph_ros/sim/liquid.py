@@ -50,7 +50,8 @@ def distances_to(shape, pose, points, scene):
     """Signed distance of points to a placed shape [m], negative inside the material.
 
     Args:
-        shape, pose: the shape and where its frame is in the scene's frame.
+        shape: the shape.
+        pose: of the shape's frame in the scene's frame.
         points: scene's frame [m], (N, 3).
         scene: for spacing, support radius and dimension.
 

@@ -33,8 +33,9 @@ def quantity(unit, default=dataclasses.MISSING, *, low=-math.inf, high=math.inf,
     Args:
         unit: of the number, for messages; "1" if it has none.
         default: None makes the field optional.
-        low, high: accepted, both included.
-        above: lower bound that is not included.
+        low: lowest accepted value.
+        high: highest accepted value.
+        above: lower bound that is not itself accepted.
     """
     limits = {"unit": unit, "low": low, "high": high, "above": above}
     return field(default=default, metadata=limits)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The program `sph_ros`: its subcommands and their options.
+
+What a subcommand needs is imported when it runs, so that `--help` and typing errors answer at once.
+"""
+
+import argparse
+import os
+import sys
+
+
+def main(argv=None):
+    """Run `sph_ros ARGS`; returns the exit status.
+
+    Args:
+        argv: arguments after the program's name; None for those of the process.
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv[:1] == ["demo"]:  # has its own options, and its own --help
+        from sph_ros.demo import main as demo
+
+        return demo(argv[1:])
+    options = _parser().parse_args(argv)
+    try:
+        return options.run(options)
+    except _user_errors() as error:
+        print(f"sph_ros {options.command}: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:  # the reader of our output went away, as in `sph_ros scenes | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        print(f"sph_ros {options.command}: interrupted, nothing was written", file=sys.stderr)
+        return 130
+
+
+def _user_errors():
+    """What people can cause; each carries one line that says how to mend it."""
+    from msg_adapters.bags import BagError
+    from sph_ros.sim.scene_yaml import SceneError
+    from sph_ros.simulate import SimulateError
+
+    return SceneError, BagError, SimulateError
+
+
+def _parser():
+    parser = argparse.ArgumentParser(
+        prog="sph_ros",
+        description="A real-time particle liquid, without middleware: scenes, offline runs, demo.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    scenes = commands.add_parser("scenes", help="list the packaged scenes")
+    scenes.set_defaults(run=_scenes)
+
+    check = commands.add_parser("check", help="validate a scene and say what it needs")
+    check.add_argument("scene", metavar="SCENE", help="name of a packaged scene, or a YAML file")
+    check.set_defaults(run=_check)
+
+    commands.add_parser(
+        "demo", help="the node, a recorded hand and a live view at once", add_help=False
+    )
+    _add_simulate(commands)
+    return parser
+
+
+def _add_simulate(commands):
+    simulate = commands.add_parser(
+        "simulate",
+        help="run a scene offline into a bag, a video and a plot",
+        description="Run a scene as fast as the machine allows, without middleware. The same scene "
+        "and bag give the same bytes. DIR is itself a rosbag2 folder with result.mcap; beside it "
+        "lie video.mp4, last.png, history.csv and history.png.",
+    )
+    add = simulate.add_argument
+    add("scene", metavar="SCENE", help="name of a packaged scene, or a YAML file")
+    add("--bag", help="recorded PoseStamped messages that move solids: packaged name, or a path")
+    add(
+        "--remap",
+        action="append",
+        default=[],
+        type=_remap,
+        metavar="A:=B",
+        help="poses on the bag's topic A move the solid B (a name, or its pose topic); may repeat",
+    )
+    add("--ignore-frame", action="store_true", help="take poses in any frame as the scene's frame")
+    add("--seconds", type=_positive, help="how long; default: the bag's length, else 5")
+    add("--out", metavar="DIR", help="folder to make; default: out/SCENE")
+    add("--force", action="store_true", help="replace results that DIR holds already")
+    add("--fps", type=_positive, default=30.0, help="recorded frames per second (default: 30)")
+    add("--no-video", dest="video", action="store_false", help="no video.mp4, no last.png")
+    add("--size", type=_size, default=(960, 720), metavar="WxH", help="of the video [pixels]")
+    simulate.set_defaults(run=_simulate)
+
+
+# ---------------------------------------------------------------- options
+
+
+def _positive(text):
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def _size(text):
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 960x720, got {text!r}")
+    size = int(width), int(height)
+    if not all(16 <= side <= 8192 and side % 2 == 0 for side in size):
+        raise argparse.ArgumentTypeError(f"expected even numbers from 16 to 8192, got {text!r}")
+    return size
+
+
+def _remap(text):
+    source, sign, target = text.partition(":=")
+    if not (source and sign and target):
+        raise argparse.ArgumentTypeError(f"expected A:=B, got {text!r}")
+    return source, target
+
+
+# ---------------------------------------------------------------- subcommands
+
+
+def _scenes(_options):
+    from sph_ros.sim.scene import list_scenes, load_scene
+
+    for name in list_scenes():
+        print(f"{name:16} {load_scene(name).description}")
+    return 0
+
+
+def _check(options):
+    from sph_ros.sim.liquid import BYTES_PER_PARTICLE, available_memory
+    from sph_ros.sim.scene import load_scene
+
+    scene = load_scene(options.scene)
+
+    from sph_ros.sim.simulation import Simulation
+
+    sim = Simulation(scene)
+    count = len(sim.positions)
+    needed = count * BYTES_PER_PARTICLE
+    chosen = "chosen" if scene.time_step is None else "given"
+    solids = ", ".join(f"{solid.name} ({solid.control})" for solid in scene.solids) or "none"
+    print(f"{scene.source}: good")
+    print(f"particles: {count:,} of {scene.material.name}, spacing {scene.spacing:g} m")
+    print(f"solver:    {scene.solver}, {scene.dimension}D")
+    print(f"time step: {sim.time_step * 1e3:.3g} ms ({chosen})")
+    print(f"solids:    {solids}")
+    print(f"memory:    about {needed / 1e6:,.0f} MB of {available_memory() / 1e6:,.0f} MB")
+    return 0
+
+
+def _simulate(options):
+    from sph_ros.simulate import simulate
+
+    summary = simulate(
+        options.scene,
+        options.out,
+        bag=options.bag,
+        remaps=dict(options.remap),
+        ignore_frame=options.ignore_frame,
+        seconds=options.seconds,
+        fps=options.fps,
+        size=options.size if options.video else None,
+        force=options.force,
+    )
+    print(summary)
+    return 0 if summary.complete else 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
