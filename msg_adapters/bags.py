@@ -51,6 +51,7 @@ class Topic(NamedTuple):
     name: str
     type: str
     count: int
+    transient_local: bool = False  # whether the recorded publisher kept messages for late joiners
 
 
 class BagMessage(NamedTuple):
@@ -388,7 +389,11 @@ def _topics(path: Path, connections: list[Connection]) -> dict[str, Topic]:
                 f"{path}: topic {connection.topic} has {before.type} and {message_type}, "
                 "expected one message type"
             )
-        topics[connection.topic] = before._replace(count=before.count + connection.msgcount)
+        durabilities = [qos.durability.name for qos in connection.ext.offered_qos_profiles]
+        topics[connection.topic] = before._replace(
+            count=before.count + connection.msgcount,
+            transient_local=before.transient_local or "TRANSIENT_LOCAL" in durabilities,
+        )
     return topics
 
 
