@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where particles feel solids: wall densities, the push back, friction, and the reaction on each solid.
+
+A contact is one particle near one solid. All solids around a particle act together by the product rule of
+`walls`: the liquid's share of the support is the product of what each solid leaves free.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from sph_ros.core.distances import distance_and_normal, signed_distance
+from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.walls import wall_terms
+
+#: Columns of `Contacts.terms`.
+FRACTION, NEAR_FRACTION, GRADIENT, NEAR_GRADIENT, NORMAL, SURFACE_VELOCITY = 0, 1, 2, 5, 8, 11
+TERMS = 14
+
+
+class Motion(NamedTuple):
+    """Where the solids are at the start and at the end of a substep.
+
+    Attributes:
+        old_position, position: origins, world frame [m], (S, 3) float32.
+        old_rotation, rotation: world from solid, (S, 3, 3) float32.
+    """
+
+    old_position: np.ndarray
+    old_rotation: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+class Contacts(NamedTuple):
+    """Contacts of particle i are rows start[i]:end[i].
+
+    Attributes:
+        start, end: (N,) int64.
+        solid: (K,) int32.
+        terms: the columns named above, world frame; gradients already include the other solids' share and
+            are [1/m], the surface's velocity [m/s], (K, TERMS) float32.
+        density: density and near-density that all solids add to particle i [-], (N, 2).
+        gradients: sums of the gradients over the contacts [1/m], (N, 6).
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    solid: np.ndarray
+    terms: np.ndarray
+    density: np.ndarray
+    gradients: np.ndarray
+
+
+@device
+def to_solid(rotation, origin, s, x, y, z):
+    """World point in the frame of solid s."""
+    dx, dy, dz = x - origin[s, 0], y - origin[s, 1], z - origin[s, 2]
+    r = rotation[s]
+    return (
+        r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
+        r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
+        r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
+    )
+
+
+@device
+def rotate(rotation, s, x, y, z):
+    """World direction of a direction in the frame of solid s."""
+    r = rotation[s]
+    return (
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
+    )
+
+
+@device
+def to_world(rotation, origin, s, x, y, z):
+    """World point of a point in the frame of solid s."""
+    wx, wy, wz = rotate(rotation, s, x, y, z)
+    return wx + origin[s, 0], wy + origin[s, 1], wz + origin[s, 2]
+
+
+@device
+def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
+    """Write the contact of a point with solid s to `row` if it is near; whether it was."""
+    lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
+    found = wall_terms(shapes, s, lx, ly, lz)
+    fraction = found[4]
+    if fraction <= np.float32(0.0):
+        return False
+    solid[row] = s
+    terms[row, FRACTION] = fraction
+    terms[row, NEAR_FRACTION] = found[8]
+    for column, first in ((GRADIENT, 5), (NEAR_GRADIENT, 9), (NORMAL, 1)):
+        wx, wy, wz = rotate(motion.rotation, s, found[first], found[first + 1], found[first + 2])
+        terms[row, column] = wx
+        terms[row, column + 1] = wy
+        terms[row, column + 2] = wz
+    # The point of the solid that is now here was there before the substep.
+    ox, oy, oz = to_world(motion.old_rotation, motion.old_position, s, lx, ly, lz)
+    terms[row, SURFACE_VELOCITY] = (x - ox) * inverse_step
+    terms[row, SURFACE_VELOCITY + 1] = (y - oy) * inverse_step
+    terms[row, SURFACE_VELOCITY + 2] = (z - oz) * inverse_step
+    return True
+
+
+@device
+def combine_contacts(contacts, i, begin, end):
+    """Product rule over the contacts of particle i: densities and gradients."""
+    terms = contacts.terms
+    free, near_free = np.float32(1.0), np.float32(1.0)
+    for k in range(begin, end):
+        free *= np.float32(1.0) - terms[k, FRACTION]
+        near_free *= np.float32(1.0) - terms[k, NEAR_FRACTION]
+    contacts.density[i, 0] = np.float32(1.0) - free
+    contacts.density[i, 1] = np.float32(1.0) - near_free
+    for axis in range(6):
+        contacts.gradients[i, axis] = 0.0
+    for k in range(begin, end):
+        others, near_others = np.float32(1.0), np.float32(1.0)
+        for other in range(begin, end):
+            if other != k:
+                others *= np.float32(1.0) - terms[other, FRACTION]
+                near_others *= np.float32(1.0) - terms[other, NEAR_FRACTION]
+        for axis in range(3):
+            terms[k, GRADIENT + axis] *= others
+            terms[k, NEAR_GRADIENT + axis] *= near_others
+            contacts.gradients[i, axis] += terms[k, GRADIENT + axis]
+            contacts.gradients[i, 3 + axis] += terms[k, NEAR_GRADIENT + axis]
+
+
+@parallel_kernel
+def find_contacts(positions, shapes, motion, inverse_step, chunks, contacts):
+    """Contacts of all particles with the solids at the end of the substep.
+
+    Args:
+        positions: predicted, none inside a solid [m], (N, 3).
+        shapes: packed shapes of the S solids.
+        motion: poses of the solids.
+        inverse_step: 1 / substep [1/s], float32.
+        chunks: `chunk_count(N)`.
+        contacts: all written; needs room for chunks * CHUNK * S contacts.
+    """
+    count = positions.shape[0]
+    solids = motion.position.shape[0]
+    starts, ends = contacts.start, contacts.end
+    for chunk in prange(chunks):
+        cursor = chunk * CHUNK * solids
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+            starts[i] = cursor
+            for s in range(solids):
+                if add_contact(
+                    shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
+                ):
+                    cursor += 1
+            ends[i] = cursor
+            combine_contacts(contacts, i, starts[i], cursor)
+
+
+@device
+def add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz):
+    """Add a force at a world point to the wrench on solid s about its origin."""
+    rx = x - motion.position[s, 0]
+    ry = y - motion.position[s, 1]
+    rz = z - motion.position[s, 2]
+    reactions[chunk, s, 0] += fx
+    reactions[chunk, s, 1] += fy
+    reactions[chunk, s, 2] += fz
+    reactions[chunk, s, 3] += ry * fz - rz * fy
+    reactions[chunk, s, 4] += rz * fx - rx * fz
+    reactions[chunk, s, 5] += rx * fy - ry * fx
+
+
+@parallel_kernel
+def pressure_reactions(
+    positions, contacts, motion, sums, pressures, tension, scale, reactions
+):
+    """Reaction of the solids' push by pressure and cohesion, the same terms that moved the particles.
+
+    Args:
+        positions: predicted [m], (N, 3).
+        contacts, motion: of this substep.
+        sums, tension: as in `cohesive_displacements`.
+        pressures: scaled [m^2], (N,).
+        scale: particle mass / substep^2 [kg/s^2].
+        reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.
+    """
+    count = positions.shape[0]
+    two = np.float32(2.0)
+    for chunk in prange(reactions.shape[0]):
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            if contacts.start[i] == contacts.end[i]:
+                continue
+            pull = tension.cohesion * (sums.density[i] - np.float32(1.0)) - tension.near
+            push = two * (pressures[i] + tension.adhesion * pull) * scale
+            near_push = two * tension.near * tension.virial_ratio * sums.near_density[i] * scale
+            for k in range(contacts.start[i], contacts.end[i]):
+                t = contacts.terms[k]
+                add_reaction(
+                    reactions,
+                    chunk,
+                    contacts.solid[k],
+                    motion,
+                    positions[i, 0],
+                    positions[i, 1],
+                    positions[i, 2],
+                    push * t[GRADIENT] + near_push * t[NEAR_GRADIENT],
+                    push * t[GRADIENT + 1] + near_push * t[NEAR_GRADIENT + 1],
+                    push * t[GRADIENT + 2] + near_push * t[NEAR_GRADIENT + 2],
+                )
+
+
+@parallel_kernel
+def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, reactions):
+    """Friction: solids take a share of the sliding speed of the liquid along them.
+
+    The share is taken implicitly, so no rate is too large.
+
+    Args:
+        positions: [m], (N, 3).
+        contacts, motion: of this substep.
+        rate: share per unit of wall fraction [-], float32.
+        drag: share per unit of wall fraction and sliding speed [s/m], float32.
+        scale: particle mass / substep [kg/s].
+        velocities: [m/s], (N, 3); changed.
+        reactions: as in `pressure_reactions`; added to.
+    """
+    count = positions.shape[0]
+    for chunk in prange(reactions.shape[0]):
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            for k in range(contacts.start[i], contacts.end[i]):
+                t = contacts.terms[k]
+                sx = velocities[i, 0] - t[SURFACE_VELOCITY]
+                sy = velocities[i, 1] - t[SURFACE_VELOCITY + 1]
+                sz = velocities[i, 2] - t[SURFACE_VELOCITY + 2]
+                along = sx * t[NORMAL] + sy * t[NORMAL + 1] + sz * t[NORMAL + 2]
+                sx -= along * t[NORMAL]
+                sy -= along * t[NORMAL + 1]
+                sz -= along * t[NORMAL + 2]
+                speed = np.sqrt(sx * sx + sy * sy + sz * sz)
+                wanted = (rate + drag * speed) * t[FRACTION]
+                share = wanted / (np.float32(1.0) + wanted)
+                velocities[i, 0] -= share * sx
+                velocities[i, 1] -= share * sy
+                velocities[i, 2] -= share * sz
+                add_reaction(
+                    reactions,
+                    chunk,
+                    contacts.solid[k],
+                    motion,
+                    positions[i, 0],
+                    positions[i, 1],
+                    positions[i, 2],
+                    scale * share * sx,
+                    scale * share * sy,
+                    scale * share * sz,
+                )
+
+
+@device
+def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest):
+    """Share of the way from a to b, in the frame of solid s, at which a point meets the solid; 1: never.
+
+    Sphere tracing: the distance is how far one can go in any direction. A start inside counts as no hit.
+    """
+    dx, dy, dz = bx - ax, by - ay, bz - az
+    if distance <= margin:
+        return np.float32(1.0)
+    along = np.float32(0.0)
+    for _ in range(64):
+        along += max(distance - margin, shortest)
+        if along >= length:
+            return np.float32(1.0)
+        share = along / length
+        distance = signed_distance(shapes, s, ax + share * dx, ay + share * dy, az + share * dz)
+        if distance <= margin:
+            return share
+    return np.float32(1.0)
+
+
+@device
+def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
+    """End of a motion from a to b that slides along solid s where it meets it, in the solid's frame."""
+    dx, dy, dz = bx - ax, by - ay, bz - az
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    distance = signed_distance(shapes, s, ax, ay, az)
+    if distance > length + margin:
+        return bx, by, bz
+    share = first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest)
+    if share < np.float32(1.0):
+        hx, hy, hz = ax + share * dx, ay + share * dy, az + share * dz
+        _, nx, ny, nz = distance_and_normal(shapes, s, hx, hy, hz)
+        inward = (bx - hx) * nx + (by - hy) * ny + (bz - hz) * nz
+        if inward < np.float32(0.0):
+            bx, by, bz = bx - inward * nx, by - inward * ny, bz - inward * nz
+    for _ in range(4):
+        distance, nx, ny, nz = distance_and_normal(shapes, s, bx, by, bz)
+        if distance >= margin:
+            break
+        step = margin - distance
+        bx, by, bz = bx + step * nx, by + step * ny, bz + step * nz
+    return bx, by, bz
+
+
+@device
+def is_free(shapes, motion, x, y, z, margin):
+    """Whether a world point keeps the margin from every solid."""
+    for s in range(motion.position.shape[0]):
+        lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
+        if signed_distance(shapes, s, lx, ly, lz) < margin:
+            return False
+    return True
+
+
+@device
+def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
+    """A free point near (x, y, z), found on growing spheres (circles in 2D); whether there is one.
+
+    For particles squeezed between solids, where projecting out of one only pushes into the other.
+    """
+    for ring in range(1, 48):
+        radius = np.float32(0.5) * spacing * ring
+        samples = 32 + 8 * ring
+        for k in range(samples):
+            # Fibonacci sphere: even, and the same every time.
+            height = np.float32(1.0) - (np.float32(2.0) * k + np.float32(1.0)) / samples
+            angle = np.float32(2.3999632) * k
+            if planar:
+                angle = np.float32(6.2831853) * k / samples
+                dx, dy, dz = np.cos(angle), np.float32(0.0), np.sin(angle)
+            else:
+                flat = np.sqrt(np.float32(1.0) - height * height)
+                dx, dy, dz = flat * np.cos(angle), flat * np.sin(angle), height
+            px, py, pz = x + radius * dx, y + radius * dy, z + radius * dz
+            if is_free(shapes, motion, px, py, pz, margin):
+                return True, px, py, pz
+    return False, x, y, z
+
+
+@parallel_kernel
+def keep_outside(
+    starts, ends, origins, shapes, motion, margin, spacing, planar, scale, reactions, squeezed
+):
+    """Stop particles at solids: sweep each along its path relative to each moving solid.
+
+    A particle starts at `starts` beside the solids at their old poses and wants to be at `ends` when they are at their
+    new ones. In a solid's own frame it moves on a straight line; where that meets the solid the rest
+    of the motion slides along it. So neither a fast particle nor a fast or thin solid passes through.
+
+    Args:
+        starts: [m], (N, 3).
+        ends: [m], (N, 3); changed where needed.
+        origins: positions that the velocity will be reckoned from [m], (N, 3); moved along with particles that
+            had to be rescued, so that a rescue is no kick.
+        shapes, motion: the S solids.
+        margin: distance to keep [m], float32.
+        spacing: of the particles [m], float32.
+        planar: 2D: positions keep y.
+        scale: particle mass / substep^2 [kg/s^2].
+        reactions: as in `pressure_reactions`; added to.
+        squeezed: particles per chunk that had no way out but a rescue, (chunks,) int64; added to.
+    """
+    count = starts.shape[0]
+    solids = motion.position.shape[0]
+    shortest = np.float32(0.1) * spacing
+    for chunk in prange(reactions.shape[0]):
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            rounds = 0
+            moved = solids > 0
+            while moved and rounds < 8:
+                moved = False
+                for s in range(solids):
+                    x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
+                    ax, ay, az = to_solid(
+                        motion.old_rotation,
+                        motion.old_position,
+                        s,
+                        starts[i, 0],
+                        starts[i, 1],
+                        starts[i, 2],
+                    )
+                    bx, by, bz = to_solid(motion.rotation, motion.position, s, x, y, z)
+                    cx, cy, cz = slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest)
+                    if cx == bx and cy == by and cz == bz:
+                        continue
+                    moved = True
+                    wx, wy, wz = to_world(motion.rotation, motion.position, s, cx, cy, cz)
+                    if planar:
+                        wy = y
+                    ends[i, 0], ends[i, 1], ends[i, 2] = wx, wy, wz
+                    add_reaction(
+                        reactions,
+                        chunk,
+                        s,
+                        motion,
+                        x,
+                        y,
+                        z,
+                        scale * (x - wx),
+                        scale * (y - wy),
+                        scale * (z - wz),
+                    )
+                rounds += 1
+            if not moved:
+                continue
+            x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
+            slack = np.float32(0.5) * margin
+            if is_free(shapes, motion, x, y, z, slack):
+                continue
+            squeezed[chunk] += 1
+            found, px, py, pz = nearest_free_point(
+                shapes, motion, x, y, z, margin, spacing, planar
+            )
+            if found:
+                ends[i, 0], ends[i, 1], ends[i, 2] = px, py, pz
+                origins[i, 0], origins[i, 1], origins[i, 2] = px, py, pz

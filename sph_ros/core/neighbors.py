@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cell-sorted particles and their neighbour lists.
+
+Particles are sorted by cell (cells of one support radius, x fastest), so the candidates of a particle are nine
+contiguous runs (three in 2D). A list and the geometry of each pair are made once a step and read by every
+pass of the solver. A particle is its own neighbour: its gradient with itself is zero and its weight is the
+self term of the density, so no pass has to make an exception.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from sph_ros.core.jit import device, kernel, parallel_kernel
+from sph_ros.core.vector import LANES, append_within
+
+#: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
+CHUNK = 256
+
+
+class Grid(NamedTuple):
+    """Cells over the particles.
+
+    Attributes:
+        lower: corner of the first cell [m], (3,) float32.
+        inverse_cell: 1 / cell size [1/m], float32.
+        counts: cells along x, y, z, (3,) int32.
+        cell_start: first particle of each cell in the sorted order, (cells + 1,) int32.
+    """
+
+    lower: np.ndarray
+    inverse_cell: np.float32
+    counts: np.ndarray
+    cell_start: np.ndarray
+
+
+class Pairs(NamedTuple):
+    """Neighbours and pair geometry; the list of particle i is rows start[i]:end[i].
+
+    Attributes:
+        start, end: (N,) int64.
+        neighbors: rows of the neighbours, (M,) int32.
+        gradients: gradient at i of the normalised density weight [1/m] and 1 - r/h [-], (M, 4).
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    neighbors: np.ndarray
+    gradients: np.ndarray
+
+
+class Sums(NamedTuple):
+    """What a particle sums over its neighbours.
+
+    Attributes:
+        density, near_density: relative to the lattice at rest, walls included [-], (N,).
+        gradient: sum of pair gradients [1/m], (N, 3).
+        gradient_square: sum of their squares [1/m^2], (N,).
+    """
+
+    density: np.ndarray
+    near_density: np.ndarray
+    gradient: np.ndarray
+    gradient_square: np.ndarray
+
+
+def chunk_count(particle_count):
+    """Pieces of parallel work for so many particles."""
+    return -(-particle_count // CHUNK)
+
+
+@device
+def cell_coordinate(value, lower, inverse_cell, count):
+    """Cell index along one axis; what lies outside the grid belongs to the outermost cell.
+
+    Clamping keeps neighbours in adjacent cells, so one stray particle needs no larger grid.
+    """
+    cell = int(np.floor((value - lower) * inverse_cell))
+    return min(max(cell, 0), count - 1)
+
+
+@kernel
+def bounding_box(positions, lower, upper):
+    """Smallest box around `positions` (N, 3) [m]; `lower`, `upper` (3,) are written.
+
+    Returns:
+        The first row that is not finite, or -1.
+    """
+    for axis in range(3):
+        lower[axis] = np.inf
+        upper[axis] = -np.inf
+    for i in range(positions.shape[0]):
+        for axis in range(3):
+            value = positions[i, axis]
+            if not np.isfinite(value):
+                return i
+            lower[axis] = min(lower[axis], value)
+            upper[axis] = max(upper[axis], value)
+    return -1
+
+
+@kernel
+def sort_by_cell(positions, grid, cell_of, order):
+    """Stable counting sort of particles by cell.
+
+    Args:
+        positions: [m], (N, 3).
+        grid: its `cell_start` is written.
+        cell_of: cell of each particle, (N,) int32; written.
+        order: order[k] is the present row of the particle that is to become row k, (N,) int32; written.
+    """
+    nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
+    cell_start = grid.cell_start
+    cells = nx * ny * nz
+    for c in range(cells + 1):
+        cell_start[c] = 0
+    for i in range(positions.shape[0]):
+        cx = cell_coordinate(positions[i, 0], grid.lower[0], grid.inverse_cell, nx)
+        cy = cell_coordinate(positions[i, 1], grid.lower[1], grid.inverse_cell, ny)
+        cz = cell_coordinate(positions[i, 2], grid.lower[2], grid.inverse_cell, nz)
+        cell = (cz * ny + cy) * nx + cx
+        cell_of[i] = cell
+        cell_start[cell + 1] += 1
+    for c in range(cells):
+        cell_start[c + 1] += cell_start[c]
+    for i in range(positions.shape[0]):
+        cell = cell_of[i]
+        order[cell_start[cell]] = i
+        cell_start[cell] += 1
+    for c in range(cells, 0, -1):
+        cell_start[c] = cell_start[c - 1]
+    cell_start[0] = 0
+
+
+@parallel_kernel
+def gather_rows(order, source, target):
+    """target[k] = source[order[k]] for rows of (N, 3) arrays."""
+    for k in prange(order.shape[0]):
+        i = order[k]
+        target[k, 0] = source[i, 0]
+        target[k, 1] = source[i, 1]
+        target[k, 2] = source[i, 2]
+
+
+@parallel_kernel
+def transpose(positions, columns):
+    """Write (N, 3) `positions` into the rows of (3, N + padding) `columns`."""
+    for i in prange(positions.shape[0]):
+        columns[0, i] = positions[i, 0]
+        columns[1, i] = positions[i, 1]
+        columns[2, i] = positions[i, 2]
+
+
+@device
+def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
+    """Append the neighbours of particle i; the new cursor, or -1 where there is no room."""
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    x, y, z = xs[i], ys[i], zs[i]
+    nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
+    cx = cell_coordinate(x, grid.lower[0], grid.inverse_cell, nx)
+    cy = cell_coordinate(y, grid.lower[1], grid.inverse_cell, ny)
+    cz = cell_coordinate(z, grid.lower[2], grid.inverse_cell, nz)
+    first, last = max(cx - 1, 0), min(cx + 1, nx - 1)
+    for kz in range(max(cz - 1, 0), min(cz + 2, nz)):
+        for ky in range(max(cy - 1, 0), min(cy + 2, ny)):
+            row = (kz * ny + ky) * nx
+            begin = np.intp(grid.cell_start[row + first])
+            end = np.intp(grid.cell_start[row + last + 1])
+            while begin < end:
+                if cursor + LANES > limit:
+                    return np.intp(-1)
+                cursor = append_within(
+                    xs, ys, zs, begin, end, x, y, z, square, neighbors, cursor
+                )
+                begin += LANES
+    return cursor
+
+
+@parallel_kernel
+def find_neighbors(columns, grid, support_radius, chunks, pairs):
+    """Neighbour lists of all particles.
+
+    Chunk k of `CHUNK` particles appends to its own part of the list, neighbors[k * room:(k + 1) * room] with
+    room = len(neighbors) // chunks, so nothing has to be counted first.
+
+    Args:
+        columns: cell-sorted coordinates [m], (3, N + padding) with N = len(pairs.start).
+        grid: from `sort_by_cell`.
+        support_radius: h [m], float32.
+        chunks: `chunk_count(N)`.
+        pairs: `start`, `end` and `neighbors` are written.
+
+    Returns:
+        Number of chunks whose part was too small: enlarge the list and call again if it is not 0.
+    """
+    count = pairs.start.shape[0]
+    room = pairs.neighbors.shape[0] // chunks
+    square = support_radius * support_radius
+    full = 0
+    starts, ends = pairs.start, pairs.end
+    for chunk in prange(chunks):
+        cursor = np.intp(chunk * room)
+        limit = cursor + room
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            starts[i] = cursor
+            cursor = append_neighbors(i, columns, grid, square, pairs.neighbors, cursor, limit)
+            if cursor < 0:
+                full += 1
+                break
+            ends[i] = cursor
+    return full
+
+
+@parallel_kernel
+def sum_densities(columns, support_radius, density_scale, near_scale, wall_density, pairs, sums):
+    """Pair geometry, both densities and gradient sums of every particle (Clavet 2005, Alg. 2).
+
+    Args:
+        columns: as in `find_neighbors`.
+        support_radius: h [m], float32.
+        density_scale, near_scale: 1 / lattice sums of the two weights [-], float32.
+        wall_density: density and near-density that walls add [-], (N, 2).
+        pairs: `gradients` is written.
+        sums: all written.
+    """
+    one = np.float32(1.0)
+    inverse_h = one / support_radius
+    slope = np.float32(-2.0) * density_scale * inverse_h
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    gradients = pairs.gradients
+    density, near_density = sums.density, sums.near_density
+    gradient, gradient_square = sums.gradient, sums.gradient_square
+    for i in prange(pairs.start.shape[0]):
+        x, y, z = xs[i], ys[i], zs[i]
+        w, n = np.float32(0.0), np.float32(0.0)
+        tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        square = np.float32(0.0)
+        for k in range(pairs.start[i], pairs.end[i]):
+            j = pairs.neighbors[k]
+            dx = x - xs[j]
+            dy = y - ys[j]
+            dz = z - zs[j]
+            # The tiny addend lets a particle be its own neighbour: 0 / tiny is 0.
+            r2 = dx * dx + dy * dy + dz * dz + np.float32(1e-20)
+            inverse_r = one / np.sqrt(r2)
+            u = one - r2 * inverse_r * inverse_h
+            c = slope * u * inverse_r
+            gx, gy, gz = c * dx, c * dy, c * dz
+            gradients[k, 0] = gx
+            gradients[k, 1] = gy
+            gradients[k, 2] = gz
+            gradients[k, 3] = u
+            w += u * u
+            n += u * u * u
+            tx += gx
+            ty += gy
+            tz += gz
+            square += gx * gx + gy * gy + gz * gz
+        density[i] = density_scale * w + wall_density[i, 0]
+        near_density[i] = near_scale * n + wall_density[i, 1]
+        gradient[i, 0] = tx
+        gradient[i, 1] = ty
+        gradient[i, 2] = tz
+        gradient_square[i] = square

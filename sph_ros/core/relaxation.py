@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Double density relaxation, solved for the pressure instead of taken in one explicit pass.
+
+Clavet, Beaudoin & Poulin 2005 move each pair of neighbours at their predicted positions by
+dt^2 [P (1 - q) + P_near (1 - q)^2] with P = k (rho - rho0), P_near = k_near rho_near. One such pass is explicit in the
+stiffness k. Here the same displacements are taken with the pressures that the particles have *after*
+the move, P = k (rho(x + u) - rho0) >= 0, found by relaxed Jacobi iteration on the density linearised
+about the predicted positions (the scheme of Ihmsen et al. 2014, with the compliance 1/k kept). So k may be
+that of a nearly incompressible liquid at any time step. The near-pressure and the
+cohesive part of the pressure, which make surface tension, are soft and stay explicit as in the paper.
+
+Each particle gathers from its neighbours. The two sides of a pair are the same numbers with opposite signs, so
+momentum is conserved to rounding.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from sph_ros.core.jit import parallel_kernel
+from sph_ros.core.neighbors import CHUNK
+
+
+class Tension(NamedTuple):
+    """Stiffnesses that make surface tension, times dt^2 / (rho0 virial); all float32.
+
+    Attributes:
+        cohesion: of the cohesive pressure [m^2].
+        near: of the near-pressure [m^2].
+        virial_ratio: virial of the density weight / virial of the near weight [-].
+        adhesion: share of the cohesion that walls exert, 0 to 1 [-].
+    """
+
+    cohesion: np.float32
+    near: np.float32
+    virial_ratio: np.float32
+    adhesion: np.float32
+
+
+@parallel_kernel
+def predict_positions(positions, velocities, gravity, time_step, predicted):
+    """Positions after a step without any interaction (Clavet 2005, Alg. 1, lines 1-10).
+
+    Args:
+        positions: [m], (N, 3).
+        velocities: [m/s], (N, 3).
+        gravity: [m/s^2], (3,) float32.
+        time_step: [s], float32.
+        predicted: [m], (N, 3); written.
+    """
+    for i in prange(positions.shape[0]):
+        for axis in range(3):
+            velocity = velocities[i, axis] + time_step * gravity[axis]
+            predicted[i, axis] = positions[i, axis] + time_step * velocity
+
+
+@parallel_kernel
+def cohesive_displacements(
+    pairs, sums, contact_gradients, tension, weight_ratio, displacements
+):
+    """Displacement by near-pressure and by the cohesive part of the pressure: surface tension.
+
+    Both pressures are scaled by dt^2 / (rho0 virial) [m^2]. In the bulk at rest they cancel: the rest density of
+    the cohesive part lies above 1 by near / cohesion. The work they do belongs to a potential (a sum of squares of
+    both densities), so they cannot feed energy into a drop.
+
+    Args:
+        pairs, sums: from `sum_densities`.
+        contact_gradients: gradients of the density and the near-density that walls add [1/m], (N, 6).
+        tension: scaled stiffnesses, `Tension`.
+        weight_ratio: 3/2 density lattice sum / near lattice sum: near gradient per density gradient and
+            (1 - r/h) [-], float32.
+        displacements: [m], (N, 3); written.
+    """
+    cohesion, near = tension.cohesion, tension.near * tension.virial_ratio
+    offset = cohesion + tension.near
+    for i in prange(pairs.start.shape[0]):
+        own = cohesion * sums.density[i] - offset
+        own_near = near * sums.near_density[i]
+        x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(pairs.start[i], pairs.end[i]):
+            j = pairs.neighbors[k]
+            both = own + cohesion * sums.density[j] - offset
+            both_near = own_near + near * sums.near_density[j]
+            c = both + weight_ratio * pairs.gradients[k, 3] * both_near
+            x += c * pairs.gradients[k, 0]
+            y += c * pairs.gradients[k, 1]
+            z += c * pairs.gradients[k, 2]
+        wall = np.float32(2.0) * tension.adhesion * own
+        wall_near = np.float32(2.0) * own_near
+        g = contact_gradients
+        displacements[i, 0] = -x - wall * g[i, 0] - wall_near * g[i, 3]
+        displacements[i, 1] = -y - wall * g[i, 1] - wall_near * g[i, 4]
+        displacements[i, 2] = -z - wall * g[i, 2] - wall_near * g[i, 5]
+
+
+@parallel_kernel
+def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
+    """How much a particle's own scaled pressure lowers its own density [1/m^2].
+
+    Args:
+        sums: from `sum_densities`.
+        contact_gradients: as in `cohesive_displacements`.
+        compliance: density per scaled pressure that the liquid itself yields [1/m^2], float32.
+        diagonal: (N,); written.
+    """
+    for i in prange(diagonal.shape[0]):
+        own = sums.gradient_square[i] + compliance
+        for axis in range(3):
+            total = sums.gradient[i, axis]
+            wall = contact_gradients[i, axis]
+            own += (total + wall) * (total + np.float32(2.0) * wall)
+        diagonal[i] = max(own, compliance + np.float32(1e-12))
+
+
+@parallel_kernel
+def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displacements):
+    """Displacements by the present pressures (Clavet 2005, Alg. 2, gathered).
+
+    Args:
+        pairs: from `sum_densities`.
+        pressures: times dt^2 / (rho0 virial) [m^2], (N,).
+        contact_gradients: as in `cohesive_displacements`.
+        cohesive: displacements to start from [m], (N, 3).
+        displacements: [m], (N, 3); written.
+    """
+    for i in prange(pressures.shape[0]):
+        own = pressures[i]
+        x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(pairs.start[i], pairs.end[i]):
+            both = own + pressures[pairs.neighbors[k]]
+            x += both * pairs.gradients[k, 0]
+            y += both * pairs.gradients[k, 1]
+            z += both * pairs.gradients[k, 2]
+        wall = np.float32(2.0) * own
+        displacements[i, 0] = cohesive[i, 0] - x - wall * contact_gradients[i, 0]
+        displacements[i, 1] = cohesive[i, 1] - y - wall * contact_gradients[i, 1]
+        displacements[i, 2] = cohesive[i, 2] - z - wall * contact_gradients[i, 2]
+
+
+@parallel_kernel
+def correct_pressures(
+    pairs, sums, contact_gradients, displacements, diagonal, compliance, relaxation, pressures, errors
+):
+    """One relaxed Jacobi iteration towards p = k (density - 1) >= 0 at the displaced positions.
+
+    Args:
+        pairs, sums: from `sum_densities`.
+        contact_gradients: as in `cohesive_displacements`.
+        displacements: by the present pressures [m], (N, 3).
+        diagonal: from `pressure_diagonal`.
+        compliance: as in `pressure_diagonal`.
+        relaxation: share of the Jacobi correction that is taken [-], float32.
+        pressures: scaled [m^2], (N,); improved in place.
+        errors: sum over each chunk of the density error left [-], (chunks,) float64; written.
+    """
+    count = pressures.shape[0]
+    for chunk in prange(errors.shape[0]):
+        error = 0.0
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+            change = (
+                contact_gradients[i, 0] * x
+                + contact_gradients[i, 1] * y
+                + contact_gradients[i, 2] * z
+            )
+            for k in range(pairs.start[i], pairs.end[i]):
+                j = pairs.neighbors[k]
+                change += (
+                    pairs.gradients[k, 0] * (x - displacements[j, 0])
+                    + pairs.gradients[k, 1] * (y - displacements[j, 1])
+                    + pairs.gradients[k, 2] * (z - displacements[j, 2])
+                )
+            pressure = pressures[i]
+            residual = sums.density[i] - np.float32(1.0) + change - compliance * pressure
+            pressures[i] = max(pressure + relaxation * residual / diagonal[i], np.float32(0.0))
+            # Where there is no pressure a lack of density is a free surface, not an error.
+            if residual > np.float32(0.0) or pressure > np.float32(0.0):
+                error += abs(residual)
+        errors[chunk] = error
+
+
+@parallel_kernel
+def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
+    """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
+
+    The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also press. The
+    quadratic one acts on approaching pairs. No pair gives more than half its relative speed.
+
+    Args:
+        pairs: from `sum_densities`.
+        velocities: [m/s], (N, 3).
+        slope: length of a pair's gradient divided by (1 - r/h) [1/m], float32.
+        linear: impulse per relative speed, time step included [-], float32.
+        quadratic: impulse per squared relative speed, time step included [s/m], float32.
+        changed: velocities afterwards [m/s], (N, 3); written.
+    """
+    half = np.float32(0.5)
+    zero = np.float32(0.0)
+    inverse_slope2 = np.float32(1.0) / (slope * slope)
+    for i in prange(velocities.shape[0]):
+        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
+        ax, ay, az = zero, zero, zero
+        for k in range(pairs.start[i], pairs.end[i]):
+            j = pairs.neighbors[k]
+            gx, gy, gz = pairs.gradients[k, 0], pairs.gradients[k, 1], pairs.gradients[k, 2]
+            u = pairs.gradients[k, 3]
+            # Relative speed along the line from i to j, times slope u; positive: they approach.
+            along = (
+                (vx - velocities[j, 0]) * gx
+                + (vy - velocities[j, 1]) * gy
+                + (vz - velocities[j, 2]) * gz
+            )
+            inverse_u = np.float32(1.0) / (u + np.float32(1e-3))
+            approach = max(along, zero) * inverse_u / slope
+            share = min(linear * u + quadratic * u * approach, half)
+            c = share * along * inverse_u * inverse_u * inverse_slope2
+            ax -= c * gx
+            ay -= c * gy
+            az -= c * gz
+        changed[i, 0] = vx + ax
+        changed[i, 1] = vy + ay
+        changed[i, 2] = vz + az
+
+
+@parallel_kernel
+def viscous_operator(pairs, velocities, slope, linear, result):
+    """Left side of implicit viscosity: v minus the linear impulses that v itself would cause.
+
+    Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum is kept
+    by every iteration.
+
+    Args:
+        pairs, velocities, slope, linear: as in `viscous_impulses`.
+        result: [m/s], (N, 3); written.
+    """
+    scale = linear / (slope * slope)
+    for i in prange(velocities.shape[0]):
+        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
+        ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(pairs.start[i], pairs.end[i]):
+            j = pairs.neighbors[k]
+            gx, gy, gz = pairs.gradients[k, 0], pairs.gradients[k, 1], pairs.gradients[k, 2]
+            along = (
+                (vx - velocities[j, 0]) * gx
+                + (vy - velocities[j, 1]) * gy
+                + (vz - velocities[j, 2]) * gz
+            )
+            c = scale * along / (pairs.gradients[k, 3] + np.float32(1e-3))
+            ax += c * gx
+            ay += c * gy
+            az += c * gz
+        result[i, 0] = vx + ax
+        result[i, 1] = vy + ay
+        result[i, 2] = vz + az
+
+
+@parallel_kernel
+def chunk_dots(a, b, sums):
+    """Scalar product of (N, 3) arrays per chunk of rows, (chunks,) float64; written."""
+    count = a.shape[0]
+    for chunk in prange(sums.shape[0]):
+        total = 0.0
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            for axis in range(3):
+                total += np.float64(a[i, axis]) * np.float64(b[i, axis])
+        sums[chunk] = total
+
+
+@parallel_kernel
+def finish_positions(predicted, displacements, longest, ends):
+    """Relaxed positions: predicted plus displacement, which no correction may make longer than `longest`.
+
+    Args:
+        predicted, displacements: [m], (N, 3).
+        longest: [m], float32.
+        ends: [m], (N, 3); written.
+    """
+    for i in prange(predicted.shape[0]):
+        x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        scale = np.float32(1.0)
+        if length > longest:
+            scale = longest / length
+        ends[i, 0] = predicted[i, 0] + scale * x
+        ends[i, 1] = predicted[i, 1] + scale * y
+        ends[i, 2] = predicted[i, 2] + scale * z
+
+
+@parallel_kernel
+def velocities_from_positions(starts, ends, inverse_step, velocities, fastest):
+    """Velocity is the way made over the step (Clavet 2005, Alg. 1, line 21).
+
+    Args:
+        starts, ends: [m], (N, 3).
+        inverse_step: 1 / dt [1/s], float32.
+        velocities: [m/s], (N, 3); written.
+        fastest: largest squared speed of each chunk [m^2/s^2], (chunks,) float64; written.
+    """
+    count = starts.shape[0]
+    for chunk in prange(fastest.shape[0]):
+        most = 0.0
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            square = np.float32(0.0)
+            for axis in range(3):
+                velocity = (ends[i, axis] - starts[i, axis]) * inverse_step
+                velocities[i, axis] = velocity
+                square += velocity * velocity
+            most = max(most, square)
+        fastest[chunk] = most

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Liquids in SI units, and the packaged ones by name."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+#: Field -> (lowest, highest) accepted value; also the ranges of the ROS parameters.
+RANGES = {
+    "density": (1.0, 50_000.0),
+    "viscosity": (0.0, 1_000.0),
+    "surface_tension": (0.0, 10.0),
+    "compression": (0.0005, 0.2),
+    "wall_friction": (0.0, 1.0),
+    "adhesion": (0.0, 1.0),
+    "quadratic_viscosity": (0.0, 10.0),
+}
+
+
+@dataclass(frozen=True)
+class Material:
+    """A liquid.
+
+    Attributes:
+        name: what people call it.
+        density: rest density [kg/m^3].
+        viscosity: dynamic viscosity [Pa s].
+        surface_tension: against air [N/m].
+        compression: relative compression allowed at the deepest point of the liquid at rest [-]; the
+            stiffness follows from it.
+        wall_friction: 0 lets the liquid slip along solids, 1 drags it with them [-].
+        adhesion: how strongly solids hold the liquid, as a share of its own cohesion [-].
+        quadratic_viscosity: Clavet's beta times the spacing: damps pairs that collide fast [-].
+    """
+
+    name: str = "water"
+    density: float = 1000.0
+    viscosity: float = 0.001
+    surface_tension: float = 0.072
+    compression: float = 0.01
+    wall_friction: float = 0.1
+    adhesion: float = 0.5
+    quadratic_viscosity: float = 0.3
+
+    def __post_init__(self):
+        """Refuse what is no number or out of range."""
+        for field, (low, high) in RANGES.items():
+            value = getattr(self, field)
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{field}: expected a number, got {value!r}")
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ValueError(f"{field}: expected {low:g} to {high:g}, got {value!r}")
+
+
+MATERIALS = {
+    material.name: material
+    for material in (
+        Material(),
+        Material("oil", density=910.0, viscosity=0.08, surface_tension=0.033, wall_friction=0.5),
+        Material("honey", density=1420.0, viscosity=8.0, surface_tension=0.05, wall_friction=1.0),
+        Material("cream", density=1000.0, viscosity=2.0, surface_tension=0.05, wall_friction=0.9),
+        Material("mercury", density=13_534.0, viscosity=0.00155, surface_tension=0.485),
+        Material(
+            "air_like",
+            density=1000.0,
+            viscosity=0.0,
+            surface_tension=0.0,
+            compression=0.05,
+            wall_friction=0.0,
+            quadratic_viscosity=0.0,
+        ),
+    )
+}
+
+
+def list_materials():
+    """Names of the packaged materials."""
+    return sorted(MATERIALS)
+
+
+def changed(material, **fields):
+    """A copy of `material` with `fields` replaced.
+
+    Raises:
+        ValueError: an unknown field, or a value out of its range.
+    """
+    unknown = sorted(set(fields) - set(RANGES))
+    if unknown:
+        raise ValueError(f"{unknown[0]}: not a material parameter; expected one of {list(RANGES)}")
+    return dataclasses.replace(material, **fields)

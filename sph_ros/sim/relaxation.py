@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The relaxation solver: the order of a step."""
+
+import time
+
+import numpy as np
+
+from sph_ros.core import contacts as touch
+from sph_ros.core import neighbors as search
+from sph_ros.core import relaxation as relax
+from sph_ros.core.weights import DENSITY_POWER
+from sph_ros.sim.scales import solver_scales
+from sph_ros.sim.state import Workspace, make_grid
+
+#: Pressure iterations end when the mean density error is below this share of the allowed compression ...
+TOLERANCE = 0.1
+#: ... and after at least and at most so many.
+LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
+
+#: Share of the Jacobi correction taken in each iteration (Ihmsen et al. 2014 use one half).
+JACOBI_SHARE = np.float32(0.5)
+
+#: Distance that particles keep from solids, as a share of the spacing.
+MARGIN = 0.05
+
+#: Above this the linear viscosity is solved implicitly: explicit it would overshoot.
+EXPLICIT_VISCOSITY = 0.15
+VISCOSITY_TOLERANCE, VISCOSITY_ITERATIONS = 1e-4, 100
+
+
+class UnstableError(RuntimeError):
+    """A position or velocity is no longer a number."""
+
+
+class RelaxationSolver:
+    """Clavet's double density relaxation with the pressure solved implicitly.
+
+    Attributes:
+        scales: the numbers of the material.
+        iterations: pressure iterations of the last substep.
+        density_error: mean density error left in the last substep [-].
+        timings: milliseconds of the last step by part.
+    """
+
+    def __init__(self, scene, solids, depth):
+        """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
+        self._scene = scene
+        self._solids = solids
+        self._depth = depth
+        self._gravity = np.asarray(scene.gravity, np.float32)
+        self._h = np.float32(scene.support_radius)
+        self._work = Workspace(0, len(solids))
+        self.set_material(scene.material)
+        self.iterations = 0
+        self.density_error = 0.0
+        self.fastest = 0.0
+        self.squeezed = 0
+        self.timings = {}
+
+    def set_material(self, material):
+        """Use another material from the next substep on."""
+        self._material = material
+        self.scales = solver_scales(material, self._scene, self._depth)
+
+    def step(self, fluid, time_step):
+        """Advance `fluid` by one substep; the solids' motion must already be set.
+
+        Args:
+            fluid: changed in place.
+            time_step: [s].
+
+        Returns:
+            Force [N] and torque [N m] of the liquid on each solid, (S, 6) float64.
+
+        Raises:
+            UnstableError: a position is not a number.
+        """
+        self._prepare(fluid)
+        self._clock("start")
+        self._predict(fluid, time_step)
+        self._sort(fluid)
+        self._clock("sort")
+        self._find_contacts(time_step)
+        self._clock("solids")
+        self._find_neighbors()
+        self._clock("neighbors")
+        self._sum_densities()
+        self._clock("densities")
+        self._relax(fluid, time_step)
+        self._clock("pressure")
+        self._finish(fluid, time_step)
+        self._clock("finish")
+        self._apply_viscosity(fluid, time_step)
+        self._clock("viscosity")
+        return self._work.reactions.sum(axis=0)
+
+    def densities(self, fluid):
+        """Densities at the present positions relative to rest [-], (N,) float32, rows as in `fluid`."""
+        self._prepare(fluid)
+        work = self._work
+        work.predicted[:] = fluid.positions
+        grid = self._grid()
+        search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
+        search.gather_rows(work.order, fluid.positions, work.predicted)
+        self._grid_now = grid
+        self._find_contacts(1.0)
+        self._find_neighbors()
+        self._sum_densities()
+        density = np.empty(len(fluid), np.float32)
+        density[work.order] = work.sums.density
+        return density
+
+    def _prepare(self, fluid):
+        """Scratch memory that fits, and its running totals at zero."""
+        if self._work.count != len(fluid):
+            self._work = Workspace(len(fluid), len(self._solids))
+        self._work.reactions[:] = 0.0
+
+    def _clock(self, part):
+        now = time.perf_counter()
+        if part == "start":
+            self._passed = now
+            return
+        self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
+        self._passed = now
+
+    def _keep_outside(self, starts, ends, origins, motion, time_step):
+        work = self._work
+        scene = self._scene
+        work.squeezed[:] = 0
+        touch.keep_outside(
+            starts,
+            ends,
+            origins,
+            self._solids.packed,
+            motion,
+            np.float32(MARGIN * scene.spacing),
+            np.float32(scene.spacing),
+            scene.dimension == 2,
+            np.float32(self.scales.mass / time_step**2),
+            work.reactions,
+            work.squeezed,
+        )
+        self.squeezed += int(work.squeezed.sum())
+
+    def _predict(self, fluid, time_step):
+        """Move on with gravity; what would pass into a solid stops at it."""
+        work = self._work
+        relax.predict_positions(
+            fluid.positions,
+            fluid.velocities,
+            self._gravity,
+            np.float32(time_step),
+            work.predicted,
+        )
+        work.starts[:] = fluid.positions
+        motion = self._solids.motion
+        self._keep_outside(fluid.positions, work.predicted, work.starts, motion, time_step)
+
+    def _grid(self):
+        lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
+        bad = search.bounding_box(self._work.predicted, lower, upper)
+        if bad >= 0:
+            raise UnstableError(f"row {bad}: its position is {self._work.predicted[bad]}")
+        return make_grid(lower, upper, float(self._h), self._work.count)
+
+    def _sort(self, fluid):
+        """Order all rows by cell of the predicted positions."""
+        work = self._work
+        self._grid_now = grid = self._grid()
+        search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
+        search.gather_rows(work.order, work.starts, fluid.positions)
+        search.gather_rows(work.order, work.predicted, work.scratch)
+        work.predicted, work.scratch = work.scratch, work.predicted
+        fluid.pressures = fluid.pressures[work.order]
+        fluid.particle = fluid.particle[work.order]
+
+    def _find_contacts(self, time_step):
+        work = self._work
+        if len(self._solids):
+            touch.find_contacts(
+                work.predicted,
+                self._solids.packed,
+                self._solids.motion,
+                np.float32(1.0 / time_step),
+                work.chunks,
+                work.contacts,
+            )
+
+    def _find_neighbors(self):
+        work = self._work
+        search.transpose(work.predicted, work.columns)
+        while search.find_neighbors(
+            work.columns, self._grid_now, self._h, work.chunks, work.pairs
+        ):
+            work.enlarge_pairs()
+
+    def _sum_densities(self):
+        work = self._work
+        search.sum_densities(
+            work.columns,
+            self._h,
+            np.float32(self.scales.density_scale),
+            np.float32(self.scales.near_scale),
+            work.contacts.density,
+            work.pairs,
+            work.sums,
+        )
+
+    def _tension(self, unit):
+        return relax.Tension(
+            np.float32(self.scales.cohesion * unit),
+            np.float32(self.scales.near * unit),
+            np.float32(self.scales.near_virial_ratio),
+            np.float32(self._material.adhesion),
+        )
+
+    def _relax(self, fluid, time_step):
+        """Displacements by cohesion and by the pressures that they end up with."""
+        work, scales = self._work, self.scales
+        gradients = work.contacts.gradients
+        unit = time_step**2 / (scales.rest_density * scales.virial)
+        tension = self._tension(unit)
+        if scales.cohesion > 0.0:
+            ratio = 1.5 * scales.near_scale / scales.density_scale
+            relax.cohesive_displacements(
+                work.pairs, work.sums, gradients, tension, np.float32(ratio), work.cohesive
+            )
+        else:
+            work.cohesive[:] = 0.0
+        compliance = np.float32(1.0 / (scales.stiffness * unit))
+        relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
+        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        tolerance = TOLERANCE * self._material.compression * len(fluid)
+        for iteration in range(1, MOST_ITERATIONS + 1):
+            relax.pressure_displacements(
+                work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+            )
+            relax.correct_pressures(
+                work.pairs,
+                work.sums,
+                gradients,
+                work.displacements,
+                work.diagonal,
+                compliance,
+                JACOBI_SHARE,
+                work.scaled,
+                work.errors,
+            )
+            error = float(work.errors.sum())
+            if iteration >= LEAST_ITERATIONS and error <= tolerance:
+                break
+        relax.pressure_displacements(
+            work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+        )
+        self.iterations = iteration
+        self.density_error = error / max(len(fluid), 1)
+        np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
+        touch.pressure_reactions(
+            work.predicted,
+            work.contacts,
+            self._solids.motion,
+            work.sums,
+            work.scaled,
+            tension,
+            np.float32(scales.mass / time_step**2),
+            work.reactions,
+        )
+
+    def _finish(self, fluid, time_step):
+        """Relaxed positions outside all solids, and the velocities that follow from them."""
+        work = self._work
+        relax.finish_positions(
+            work.predicted, work.displacements, np.float32(0.5) * self._h, work.starts
+        )
+        ends = work.starts
+        still = self._solids.motion._replace(
+            old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
+        )
+        # From the predicted position, which is beside the solids as they are now.
+        self._keep_outside(work.predicted, ends, fluid.positions, still, time_step)
+        relax.velocities_from_positions(
+            fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors
+        )
+        self.fastest = float(np.sqrt(work.errors.max(initial=0.0)))
+        fluid.positions[:] = ends
+
+    def _apply_viscosity(self, fluid, time_step):
+        """Viscosity and friction, which change velocities only."""
+        work, scales = self._work, self.scales
+        slope = np.float32(
+            DENSITY_POWER * scales.density_scale / self._h
+        )
+        linear = scales.viscous_rate * time_step
+        implicit = linear > EXPLICIT_VISCOSITY
+        quadratic = scales.quadratic * time_step
+        if quadratic > 0.0 or (linear > 0.0 and not implicit):
+            relax.viscous_impulses(
+                work.pairs,
+                fluid.velocities,
+                slope,
+                np.float32(0.0 if implicit else linear),
+                np.float32(quadratic),
+                work.scratch,
+            )
+            fluid.velocities[:] = work.scratch
+        if implicit:
+            self._solve_viscosity(fluid.velocities, slope, np.float32(linear))
+        if len(self._solids):
+            s = self._scene.spacing
+            touch.rub_on_solids(
+                work.predicted,
+                work.contacts,
+                self._solids.motion,
+                np.float32(10.0 * scales.viscous_rate * time_step),
+                np.float32(self._material.wall_friction * time_step / s),
+                np.float32(scales.mass / time_step),
+                fluid.velocities,
+                work.reactions,
+            )
+
+    def _solve_viscosity(self, velocities, slope, linear):
+        """Conjugate gradients for v - impulses(v) = present v, from the present v."""
+        work = self._work
+        direction, image, residual = work.cohesive, work.scratch, work.displacements
+
+        def dot(a, b):
+            relax.chunk_dots(a, b, work.errors)
+            return float(work.errors.sum())
+
+        def apply(v):
+            relax.viscous_operator(work.pairs, v, slope, linear, image)
+
+        apply(velocities)
+        np.subtract(velocities, image, out=residual)
+        direction[:] = residual
+        square = dot(residual, residual)
+        goal = VISCOSITY_TOLERANCE**2 * max(dot(velocities, velocities), 1e-30)
+        for _ in range(VISCOSITY_ITERATIONS):
+            if square <= goal:
+                break
+            apply(direction)
+            share = np.float32(square / dot(direction, image))
+            velocities += share * direction
+            residual -= share * image
+            previous, square = square, dot(residual, residual)
+            direction *= np.float32(square / previous)
+            direction += residual

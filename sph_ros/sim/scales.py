@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From SI materials to the numbers of the solver, and the time step that suits a scene.
+
+The weights are normalised by their lattice sums (see `core.weights`), so a particle's density is 1 at rest and
+its pressure is in pascal. With w the normalised weight, m = rho0 s^d the mass and G the virial of w, the
+acceleration is a_i = -1 / (rho0 G) sum_j (p_i + p_j) grad w_ij, which for Clavet's pair displacement
+dt^2 / 2 (P_i + P_j)(1 - q) means P = 4 p / (rho0 G h sum of weights): his stiffness in SI.
+
+* Stiffness: p = K (density - 1). The deepest point of the liquid at rest bears rho0 g H and may yield by the
+  material's `compression`, so K = rho0 g H / compression. Where there is no gravity a speed stands for
+  sqrt(g H).
+* Viscosity: pair forces -gamma (1 - q) along the line of centres make the shear viscosity
+  mu = gamma n^2 / (2 d (d + 2)) integral of (1 - q) r^2 (Irving-Kirkwood; for d = 3 the well known 2 pi / 15 of
+  dissipative particle dynamics). The integral is a lattice sum here.
+* Surface tension: the potential of the cohesive pressures is
+  E = s^d sum_i [Kc / (2 G) (density - 1 - b)^2 + Kc b / (2 Gn) near_density^2] with b = Kn / Kc; the excess of
+  the outermost lattice layers per area is the surface tension, linear in Kc.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, gradient_sum, lattice_sum
+
+#: Near-stiffness per cohesive stiffness (b above).
+NEAR_SHARE = 1.0
+
+#: Stands for sqrt(g H) where gravity does not set a speed [m/s].
+LEAST_SPEED = 0.3
+
+#: Share of the support radius that the fastest expected particle crosses in a step.
+COURANT = 0.4
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Numbers of the solver for one material at one spacing.
+
+    Attributes:
+        mass: of a particle [kg] (2D: per metre of depth).
+        rest_density: [kg/m^3].
+        virial: G, what the lattice transmits per unit of nominal pressure [-].
+        stiffness: K, pressure per relative compression [Pa].
+        cohesion, near: stiffness of the cohesive and the near-pressure [Pa].
+        density_scale, near_scale: 1 / lattice sums [-].
+        near_virial_ratio: G / Gn, so that both pressures cancel at rest [-].
+        viscous_rate: linear impulse per relative speed and second [1/s].
+        quadratic: quadratic impulse per squared relative speed and second [1/m].
+    """
+
+    mass: float
+    rest_density: float
+    virial: float
+    stiffness: float
+    cohesion: float
+    near: float
+    density_scale: float
+    near_scale: float
+    near_virial_ratio: float
+    viscous_rate: float
+    quadratic: float
+
+
+def liquid_depth(scene, positions):
+    """Extent of the liquid along gravity [m]."""
+    g = math.sqrt(sum(c * c for c in scene.gravity))
+    if g == 0.0 or len(positions) == 0:
+        return 0.0
+    along = positions @ [-c / g for c in scene.gravity]
+    return float(along.max() - along.min()) + scene.spacing
+
+
+def solver_scales(material, scene, depth):
+    """The solver's numbers for `material` in `scene` with liquid `depth` [m] deep."""
+    h, s, d = scene.support_radius, scene.spacing, scene.dimension
+    g = math.sqrt(sum(c * c for c in scene.gravity))
+    virial = gradient_sum(DENSITY_POWER, h, s, d)
+    near_virial = gradient_sum(NEAR_POWER, h, s, d)
+    cohesion = material.surface_tension / surface_energy(h, s, d)
+    viscous_sum = sum((1 - r / h) * r * r for r, _ in _neighbors(h, s, d))
+    return Scales(
+        mass=material.density * s**d,
+        rest_density=material.density,
+        virial=virial,
+        stiffness=material.density * max(g * depth, LEAST_SPEED**2) / material.compression,
+        cohesion=cohesion,
+        near=NEAR_SHARE * cohesion,
+        density_scale=1.0 / lattice_sum(DENSITY_POWER, h, s, d),
+        near_scale=1.0 / lattice_sum(NEAR_POWER, h, s, d),
+        near_virial_ratio=virial / near_virial,
+        viscous_rate=2 * d * (d + 2) * material.viscosity / material.density / viscous_sum,
+        quadratic=material.quadratic_viscosity / s,
+    )
+
+
+def surface_energy(support_radius, spacing, dimension):
+    """Energy per area of a lattice's free surface for a cohesive stiffness of 1 Pa [J/m^2]."""
+    virial = gradient_sum(DENSITY_POWER, support_radius, spacing, dimension)
+    near_virial = gradient_sum(NEAR_POWER, support_radius, spacing, dimension)
+    b = NEAR_SHARE
+    bulk = b * b / (2 * virial) + b / (2 * near_virial)
+    excess = 0.0
+    for layer in range(math.ceil(support_radius / spacing)):
+        density = 1.0 - _missing(DENSITY_POWER, support_radius, spacing, dimension, layer)
+        near = 1.0 - _missing(NEAR_POWER, support_radius, spacing, dimension, layer)
+        energy = (density - 1 - b) ** 2 / (2 * virial) + b * near * near / (2 * near_virial)
+        excess += spacing * (energy - bulk)
+    return excess
+
+
+def _neighbors(support_radius, spacing, dimension):
+    """(distance [m], height in layers) of the lattice points within the support."""
+    reach = math.ceil(support_radius / spacing)
+    for offset in itertools.product(range(-reach, reach + 1), repeat=dimension):
+        r = spacing * math.sqrt(sum(c * c for c in offset))
+        if r < support_radius:
+            yield r, offset[-1]
+
+
+def _missing(power, support_radius, spacing, dimension, layer):
+    """Share of the rest density that a particle `layer` layers under a free surface lacks."""
+    lacking = math.fsum(
+        (1 - r / support_radius) ** power
+        for r, height in _neighbors(support_radius, spacing, dimension)
+        if height > layer
+    )
+    return lacking / lattice_sum(power, support_radius, spacing, dimension)
+
+
+def stable_time_step(scene, scales, drop):
+    """A step that keeps the scene stable [s], and the reason in words.
+
+    Args:
+        scene: the scene.
+        scales: of its material.
+        drop: height that the liquid can fall through [m].
+
+    Returns:
+        The step, rounded down to a number people can read, and what bounds it.
+    """
+    h, s = scene.support_radius, scene.spacing
+    g = math.sqrt(sum(c * c for c in scene.gravity))
+    initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
+    initial = max(initial, max((e.speed or 0.0 for e in scene.emitters), default=0.0))
+    speed = max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
+    bounds = {f"particles up to {speed:.2g} m/s": COURANT * h / speed}
+    soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)
+    if soft > 0:
+        bounds["surface tension"] = 0.4 * s / soft
+    reason = min(bounds, key=bounds.get)
+    step = min(bounds[reason], 0.01)
+    return (_round_down(step), reason if step == bounds[reason] else "10 ms at most")
+
+
+def _round_down(step):
+    """The largest of 1, 1.25, 1.6, 2, 2.5, 3.2, 4, 5, 6.4, 8 times a power of ten, not above `step`."""
+    exponent = math.floor(math.log10(step))
+    for mantissa in (8, 6.4, 5, 4, 3.2, 2.5, 2, 1.6, 1.25, 1):
+        value = mantissa * 10.0**exponent
+        if value <= step * (1 + 1e-9):
+            return round(value, 9 - exponent)
+    return 10.0**exponent

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene that runs: particles and solids through time."""
+
+import math
+
+import numpy as np
+
+from sph_ros.core.surface import extract_surface
+from sph_ros.sim.liquid import fill_liquid
+from sph_ros.sim.materials import changed
+from sph_ros.sim.relaxation import RelaxationSolver
+from sph_ros.sim.scales import liquid_depth, stable_time_step
+from sph_ros.sim.scene import load_scene
+from sph_ros.sim.scene_types import Scene
+from sph_ros.sim.solids import Solids, Waypoint, checked_pose
+from sph_ros.sim.state import Fluid
+
+#: A substep may carry a solid by so many spacings and a particle by so many support radii.
+SOLID_REACH, PARTICLE_REACH = 0.75, 0.8
+
+#: Substeps in a step, at most; solids are slowed down rather than let through more.
+MOST_SUBSTEPS = 8
+
+
+class Simulation:
+    """A liquid among solids, stepped in time.
+
+    Arrays of particles have a row for each particle; row i is the same particle for ever.
+
+    Attributes:
+        scene: the `Scene` it was made from.
+        time_step: of one `step` [s].
+        time_step_reason: what bounds an automatic time step, in words.
+        time: simulated time [s].
+        material: the present material.
+        timings: milliseconds of the last step by part.
+    """
+
+    def __init__(self, scene):
+        """Set up `scene`: a Scene, or whatever `load_scene` takes.
+
+        Raises:
+            SceneError: something in the scene is wrong.
+        """
+        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        self.material = self.scene.material
+        self._solids = Solids(self.scene)
+        self._start()
+
+    def _start(self):
+        """First state: the liquid of the scene, solids at their first poses."""
+        positions, velocities = fill_liquid(self.scene)
+        depth = liquid_depth(self.scene, positions)
+        self._fluid = Fluid(positions, velocities)
+        self._solver = RelaxationSolver(self.scene, self._solids, depth)
+        self._solver.set_material(self.material)
+        self.time_step, self.time_step_reason = self._choose_time_step(depth)
+        self._steps = 0
+        self._substeps = 1
+        self._reactions = np.zeros((len(self._solids), 6))
+        self._densities = None
+        self.timings = {}
+
+    def _choose_time_step(self, depth):
+        """The scene's time step, or one that keeps it stable, and why."""
+        if self.scene.time_step is not None:
+            return self.scene.time_step, "given by the scene"
+        return stable_time_step(self.scene, self._solver.scales, depth)
+
+    # ---------------------------------------------------------------- time
+
+    @property
+    def time(self):
+        """Simulated time [s]."""
+        return self._steps * self.time_step
+
+    def step(self):
+        """Advance by one time step, in as many substeps as the speeds need."""
+        count = self._substep_count()
+        duration = self.time_step / count
+        # Solids must not be faster than the liquid can follow.
+        fastest = min(
+            self.scene.max_solid_speed, SOLID_REACH * self.scene.spacing / duration
+        )
+        self._solver.timings = {}
+        self._solver.squeezed = 0
+        self._reactions[:] = 0.0
+        for part in range(count):
+            self._solids.advance(self.time + part * duration, duration, fastest)
+            self._reactions += self._solver.step(self._fluid, duration) / count
+        self.timings = self._solver.timings
+        self._substeps = count
+        self._steps += 1
+        self._densities = None
+
+    def _substep_count(self):
+        """Substeps that keep solids and particles within their reach."""
+        dt = self.time_step
+        ahead = min(
+            self._solids.distance_ahead(self.time, dt), self.scene.max_solid_speed * dt
+        )
+        particle = self._solver.fastest * dt
+        wanted = max(
+            ahead / (SOLID_REACH * self.scene.spacing),
+            particle / (PARTICLE_REACH * self.scene.support_radius),
+        )
+        return min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
+
+    def advance(self, seconds):
+        """Advance by whole steps until at least `seconds` [s] more are simulated."""
+        if not (math.isfinite(seconds) and seconds >= 0.0):
+            raise ValueError(f"seconds: expected a finite number not below 0, got {seconds!r}")
+        for _ in range(math.ceil(seconds / self.time_step - 1e-6)):
+            self.step()
+
+    def reset(self):
+        """Back to time zero: the scene's liquid, the scene's poses; the present material stays."""
+        self._solids.reset()
+        self._start()
+
+    # ---------------------------------------------------------------- liquid
+
+    @property
+    def particle_count(self):
+        """Number of particles."""
+        return len(self._fluid)
+
+    @property
+    def positions(self):
+        """Positions [m], world frame, (N, 3) float32; a copy."""
+        return self._fluid.public(self._fluid.positions)
+
+    @property
+    def velocities(self):
+        """Velocities [m/s], world frame, (N, 3) float32; a copy."""
+        return self._fluid.public(self._fluid.velocities)
+
+    @property
+    def densities(self):
+        """Densities at the present positions [kg/m^3], (N,) float32; a copy."""
+        relative = self._relative_densities()
+        return self._fluid.public(relative * np.float32(self.material.density))
+
+    @property
+    def ids(self):
+        """Number of each particle, given once and never again, (N,) uint32; a copy."""
+        return self._fluid.ids.copy()
+
+    def _relative_densities(self):
+        if self._densities is None:
+            self._densities = self._solver.densities(self._fluid)
+        return self._densities
+
+    def set_material(self, **fields):
+        """Change fields of the material at once.
+
+        Raises:
+            ValueError: an unknown field, or a value out of its range; nothing is changed then.
+        """
+        self.material = changed(self.material, **fields)
+        self._solver.set_material(self.material)
+
+    def surface(self):
+        """The liquid's surface as triangles.
+
+        Returns:
+            vertices (V, 3) float32 [m], triangles (T, 3) int32, counter-clockwise seen from outside; both
+            empty where there is no liquid.
+        """
+        vertices, triangles, _ = extract_surface(
+            self.positions,
+            self.scene.spacing,
+            support_radius=self.scene.support_radius,
+            dimension=self.scene.dimension,
+        )
+        return vertices, triangles
+
+    # ---------------------------------------------------------------- solids
+
+    @property
+    def solid_names(self):
+        """Names of the solids, in the scene's order."""
+        return self._solids.names
+
+    def solid(self, name):
+        """The solid called `name`: position, quat_xyzw, velocity, angular_velocity, signed_distance().
+
+        Raises:
+            KeyError: there is none.
+        """
+        return self._solids[name]
+
+    def move_solid(self, name, position, quat_xyzw=(0.0, 0.0, 0.0, 1.0), time=None):
+        """Let a solid sweep to a pose.
+
+        It moves steadily and arrives at `time`, but no point of it is faster than the scene's
+        `max_solid_speed`, so it may arrive later. Orders for later times queue up; one that is not later than
+        those that wait replaces them.
+
+        Args:
+            name: of a solid whose control is not `fixed`.
+            position: of its origin, world frame [m], (3,).
+            quat_xyzw: world from solid; normalised here.
+            time: simulated time of arrival [s]; None or a past one: the end of the next step.
+
+        Raises:
+            KeyError: there is no such solid.
+            ValueError: the solid is fixed, or the pose is not finite, or the quaternion is zero.
+        """
+        solid = self._solids[name]
+        if solid.control == "fixed":
+            raise ValueError(f"{name}: this solid is fixed; give it `control: topic` to move it")
+        place, quat = checked_pose(name, position, quat_xyzw)
+        soonest = self.time + self.time_step
+        if time is None or time < soonest:
+            time = soonest
+        elif not math.isfinite(time):
+            raise ValueError(f"{name}: time: expected a finite number, got {time!r}")
+        solid.order(Waypoint(float(time), place, quat))
+
+    def wrench(self, name):
+        """Force and torque of the liquid on a solid, averaged over the last step.
+
+        Momentum that the solid gave to the liquid in the step, per second and with the opposite sign.
+
+        Returns:
+            force (3,) [N] and torque (3,) about the solid's origin [N m], world frame, float64. In 2D per
+            metre of depth.
+
+        Raises:
+            KeyError: there is no such solid.
+        """
+        self._solids[name]
+        row = self._reactions[self._solids.names.index(name)]
+        return row[:3].copy(), row[3:].copy()
+
+    # ---------------------------------------------------------------- facts
+
+    def statistics(self):
+        """Facts of the present state.
+
+        Returns:
+            dict with time [s], particle_count, mean_compression and max_compression (density above rest over
+            rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s], lost_particles (those
+            outside all closed containers or no longer finite), squeezed_particles (rescued from between solids
+            in the last step), substeps and iterations of the last step, density_error (mean, left by the last
+            iteration, -). In 2D energies and momenta are per metre of depth.
+        """
+        velocities = self._fluid.velocities.astype(np.float64)
+        mass = self._solver.scales.mass
+        excess = np.maximum(self._relative_densities() - 1.0, 0.0)
+        square = np.einsum("ij,ij->i", velocities, velocities)
+        return {
+            "time": self.time,
+            "particle_count": len(self._fluid),
+            "mean_compression": float(excess.mean()) if len(excess) else 0.0,
+            "max_compression": float(excess.max(initial=0.0)),
+            "kinetic_energy": 0.5 * mass * float(square.sum()),
+            "momentum": mass * velocities.sum(axis=0),
+            "max_speed": math.sqrt(float(square.max(initial=0.0))),
+            "lost_particles": self._lost_count(),
+            "squeezed_particles": self._solver.squeezed,
+            "substeps": self._substeps,
+            "iterations": self._solver.iterations,
+            "density_error": self._solver.density_error,
+        }
+
+    def _lost_count(self):
+        """Particles that are outside some container by more than half a spacing, or not finite."""
+        lost = ~np.isfinite(self._fluid.positions).all(axis=1)
+        for solid in self._solids:
+            if type(solid.shape).__name__ == "Container":
+                distance = solid.signed_distance(self._fluid.positions)
+                lost |= distance < -0.5 * self.scene.spacing
+        return int(lost.sum())

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solids of a simulation: where they are, where they are told to go, and how they get there.
+
+A solid never teleports. Told a pose it moves there in a straight line with a steady turn, no faster than the scene's
+`max_solid_speed`, and the liquid feels every substep of the way. So a marker that jumps, flips or is lost for a
+while makes a quick push but no splash.
+"""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from sph_ros.core.contacts import Motion
+from sph_ros.core.distances import signed_distances
+from sph_ros.sim import quaternions
+from sph_ros.sim.shapes import bounding_radius, display_mesh, pack_shapes
+
+
+class Waypoint(NamedTuple):
+    """A pose to reach: time [s], position [m] (3,), quat_xyzw (4,), world frame."""
+
+    time: float
+    position: np.ndarray
+    quat_xyzw: np.ndarray
+
+
+def checked_pose(name, position, quat_xyzw):
+    """Position and unit quaternion as float64 arrays.
+
+    Raises:
+        ValueError: a value is not finite, a shape is wrong, or the quaternion is zero.
+    """
+    place = np.asarray(position, dtype=np.float64)
+    if place.shape != (3,) or not np.all(np.isfinite(place)):
+        raise ValueError(f"{name}: position: expected three finite numbers [m], got {position!r}")
+    try:
+        return place, quaternions.normalized(quat_xyzw)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+class Solid:
+    """One solid: its shape in its own frame, its pose in the world, its orders.
+
+    Attributes:
+        name, control, shape, color: from the scene.
+        position: of its origin, world frame [m], (3,).
+        quat_xyzw: world from solid, (4,).
+        velocity, angular_velocity: world frame [m/s], [rad/s], (3,), over the last substep.
+    """
+
+    def __init__(self, spec, packed, index, reach):
+        """Args: the scene's SolidSpec, the packed shapes, its index there, its largest radius [m]."""
+        self.name = spec.name
+        self.control = spec.control
+        self.shape = spec.shape
+        self.color = spec.color
+        self._spec = spec
+        self._packed = packed
+        self._index = index
+        self._reach = reach
+        self.reset()
+
+    def reset(self):
+        """Back to the pose and the path of the scene."""
+        self.position, self.quat_xyzw = checked_pose(
+            self.name, self._spec.pose.position, self._spec.pose.quat_xyzw
+        )
+        self.velocity = np.zeros(3)
+        self.angular_velocity = np.zeros(3)
+        self._waypoints = deque(
+            Waypoint(frame.time, *checked_pose(self.name, frame.position, frame.quat_xyzw))
+            for frame in self._spec.path
+        )
+
+    def mesh(self):
+        """Triangles to draw: vertices (V, 3) float32 [m] in the solid's frame, triangles (T, 3) int32."""
+        return display_mesh(self.shape)
+
+    def signed_distance(self, points):
+        """Distance of world points to the solid where it is now, negative inside the material.
+
+        Args:
+            points: [m], (M, 3).
+
+        Returns:
+            [m], (M,) float32.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        local = (points - self.position) @ quaternions.to_matrix(self.quat_xyzw)
+        distance = np.empty(len(local), np.float32)
+        signed_distances(
+            self._packed, self._index, np.ascontiguousarray(local, dtype=np.float32), distance
+        )
+        return distance
+
+    def order(self, waypoint):
+        """Add a pose to reach. One that is not later than those known replaces them."""
+        while self._waypoints and self._waypoints[-1].time >= waypoint.time:
+            self._waypoints.pop()
+        self._waypoints.append(waypoint)
+
+    def distance_ahead(self, now, duration):
+        """How far a point of the solid has to move in the next `duration` [s] if no limit held [m]."""
+        position, quat = self._wanted(now, now + duration)
+        turn = quaternions.between(self.quat_xyzw, quat)
+        return float(np.linalg.norm(position - self.position)) + self._reach * float(
+            np.linalg.norm(turn)
+        )
+
+    def advance(self, now, duration, max_speed):
+        """Move on for `duration` [s] from time `now`, no point of it faster than `max_speed` [m/s]."""
+        position, quat = self._wanted(now, now + duration)
+        shift = position - self.position
+        turn = quaternions.between(self.quat_xyzw, quat)
+        way = float(np.linalg.norm(shift)) + self._reach * float(np.linalg.norm(turn))
+        share = min(1.0, max_speed * duration / way) if way > 0.0 else 1.0
+        if share == 1.0:
+            self.position, self.quat_xyzw = position, quat
+        else:
+            self.position = self.position + share * shift
+            self.quat_xyzw = quaternions.turned(self.quat_xyzw, share * turn)
+        self.velocity = share * shift / duration
+        self.angular_velocity = share * turn / duration
+        end = now + duration
+        while len(self._waypoints) > 1 and self._waypoints[0].time <= end:
+            self._waypoints.popleft()
+        if self._waypoints and self._waypoints[0].time <= end and way * share >= way:
+            self._waypoints.popleft()
+
+    def _wanted(self, now, time):
+        """Pose at `time` on the straight way through the waypoints."""
+        ahead = None
+        for waypoint in self._waypoints:
+            ahead = waypoint
+            if waypoint.time > time:
+                break
+        if ahead is None:
+            return self.position, self.quat_xyzw
+        if ahead.time <= time:
+            return ahead.position, ahead.quat_xyzw
+        # On the way from here and now to the next waypoint that lies ahead.
+        share = (time - now) / (ahead.time - now) if ahead.time > now else 1.0
+        shift = share * (ahead.position - self.position)
+        turn = share * quaternions.between(self.quat_xyzw, ahead.quat_xyzw)
+        return self.position + shift, quaternions.turned(self.quat_xyzw, turn)
+
+
+class Solids:
+    """All solids of a scene, and their packed shapes and poses for the kernels.
+
+    Attributes:
+        packed: `PackedShapes`, for the kernels.
+        motion: `Motion`, poses at the start and the end of the present substep.
+    """
+
+    def __init__(self, scene):
+        """Pack the shapes of `scene` and put the solids at their first poses."""
+        specs = scene.solids
+        self.packed = pack_shapes(
+            [spec.shape for spec in specs],
+            scene.support_radius,
+            scene.spacing,
+            scene.dimension,
+        )
+        self._solids = {
+            spec.name: Solid(spec, self.packed, index, self._turning_radius(spec.shape))
+            for index, spec in enumerate(specs)
+        }
+        count = len(specs)
+        self.motion = Motion(
+            np.zeros((count, 3), np.float32),
+            np.zeros((count, 3, 3), np.float32),
+            np.zeros((count, 3), np.float32),
+            np.zeros((count, 3, 3), np.float32),
+        )
+        self.reset()
+
+    @staticmethod
+    def _turning_radius(shape):
+        """Radius in which turning moves material; unbounded shapes count as a metre."""
+        radius = bounding_radius(shape)
+        return radius if math.isfinite(radius) else 1.0
+
+    def __iter__(self):
+        """Over the solids, in the scene's order."""
+        return iter(self._solids.values())
+
+    def __len__(self):
+        """Number of solids."""
+        return len(self._solids)
+
+    @property
+    def names(self):
+        """Names in the scene's order."""
+        return list(self._solids)
+
+    def __getitem__(self, name):
+        """The solid called `name`.
+
+        Raises:
+            KeyError: there is none; the message lists those there are.
+        """
+        try:
+            return self._solids[name]
+        except KeyError:
+            raise KeyError(f"no solid {name!r} in this scene; it has {self.names}") from None
+
+    def reset(self):
+        """All solids back to the scene's poses."""
+        for solid in self:
+            solid.reset()
+        self._write_poses(self.motion.position, self.motion.rotation)
+        self.motion.old_position[:] = self.motion.position
+        self.motion.old_rotation[:] = self.motion.rotation
+
+    def distance_ahead(self, now, duration):
+        """The farthest that any point of a solid has to move in the next `duration` [s] [m]."""
+        return max((solid.distance_ahead(now, duration) for solid in self), default=0.0)
+
+    def advance(self, now, duration, max_speed):
+        """Move all solids on for `duration` [s]."""
+        self.motion.old_position[:] = self.motion.position
+        self.motion.old_rotation[:] = self.motion.rotation
+        for solid in self:
+            if solid.control != "fixed":
+                solid.advance(now, duration, max_speed)
+        self._write_poses(self.motion.position, self.motion.rotation)
+
+    def _write_poses(self, position, rotation):
+        for index, solid in enumerate(self):
+            position[index] = solid.position
+            rotation[index] = quaternions.to_matrix(solid.quat_xyzw)
