@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What solids are made of: frozen shapes, each in a frame of its own, lengths in metres.
 
-Every shape checks itself on construction and raises ValueError naming the field, the value and what was
-expected, so that code further in need not ask again.
+Every shape checks itself on construction and raises ValueError naming the field, the value and what
+was expected, so that code further in need not ask again.
 """
 
 import math
@@ -109,14 +109,15 @@ class Box:
                 raise ValueError(
                     f"box: expected min < max along {name}, got {lower[axis]} and {upper[axis]}"
                 )
-        _set(self, min=lower, max=upper, size=tuple(b - a for a, b in zip(lower, upper)))
+        size = tuple(b - a for a, b in zip(lower, upper, strict=True))
+        _set(self, min=lower, max=upper, size=size)
 
     def _corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         corners_given = self.min is not None and self.max is not None
         if corners_given:
             lower, upper = _vector("min", self.min), _vector("max", self.max)
             if self.size is None or _vector("size", self.size) == tuple(
-                b - a for a, b in zip(lower, upper)
+                b - a for a, b in zip(lower, upper, strict=True)
             ):
                 return lower, upper
         if self.size is None or self.min is not None or self.max is not None:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shapes and everything one asks of them: the one module to import from."""
 
+from sph_ros.sim.meshes import MeshError
+from sph_ros.sim.packing import pack_shapes
+from sph_ros.sim.shape_geometry import bounding_radius, display_mesh, volume
 from sph_ros.sim.shape_types import (
     SHAPES,
     Box,
@@ -25,10 +28,15 @@ __all__ = [
     "Cylinder",
     "Difference",
     "Mesh",
+    "MeshError",
     "Placed",
     "Plane",
     "Pose",
     "Shape",
     "Sphere",
     "Union",
+    "bounding_radius",
+    "display_mesh",
+    "pack_shapes",
+    "volume",
 ]

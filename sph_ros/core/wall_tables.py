@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wall weights tabulated over the distance to a solid (Harada, Koshizuka & Kawaguchi 2007).
+
+A solid stands for liquid at rest that is not simulated: its share of a particle's density is what
+lattice particles in its place would add, divided by the sum over the full lattice (`weights`). For
+a flat wall these are layers parallel to it at the depths (k + 1/2) spacing. For balls and cylinders
+the flat share is multiplied by the ratio of two continuous integrals of the weight, over the round
+solid and over the half space at the same distance.
+
+Every table has the columns density and near-density and covers the distances -h ... h in equal
+steps; beyond h a wall adds nothing, deeper than -h its share is `full_cover`.
+"""
+
+import math
+
+import numpy as np
+
+from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, lattice_sum
+
+POWERS = (DENSITY_POWER, NEAR_POWER)
+
+#: Steps of a table from -h to h; linear interpolation is then wrong by less than 2e-5.
+TABLE_STEPS = 512
+
+# Both integrals of the ratio vanish towards h; from here on the last good ratio is kept.
+_LAST_GOOD_RATIO = 0.95
+_QUADRATURE_STEPS = 1000
+
+
+def distances(support_radius):
+    """The distances [m] of the rows of every table, (TABLE_STEPS + 1,)."""
+    return np.linspace(-support_radius, support_radius, TABLE_STEPS + 1)
+
+
+def layer_weight(power, height, support_radius, spacing, dimension):
+    """What one infinite lattice layer adds at a height above it, mean over all places [-].
+
+    3D: (2 pi / s^2) integral of (1 - r/h)^p r dr from the height to h; 2D: (1/s) integral of the
+    weight along the line.
+
+    Args:
+        power: p of the weight (1 - r/h)^p.
+        height: distance from the layer [m], any shape.
+        support_radius: h [m].
+        spacing: s of the lattice [m].
+        dimension: 2 or 3.
+    """
+    q = np.minimum(np.abs(height) / support_radius, 1.0)
+    if dimension == 3:
+        rest = 1.0 - q
+        radial = rest ** (power + 1) / (power + 1) - rest ** (power + 2) / (power + 2)
+        return 2.0 * math.pi * (support_radius / spacing) ** 2 * radial
+    nodes, node_weights = np.polynomial.legendre.leggauss(48)
+    half_chord = np.sqrt(1.0 - q * q)[..., None]
+    along = 0.5 * half_chord * (nodes + 1.0)
+    r = np.sqrt(q[..., None] ** 2 + along**2)
+    integral = (0.5 * half_chord * node_weights * (1.0 - r) ** power).sum(axis=-1)
+    return 2.0 * support_radius / spacing * integral
+
+
+def flat_wall(distance, support_radius, spacing, dimension):
+    """Share of the rest density that a flat wall adds at a signed distance [-], (..., 2).
+
+    Sum of lattice layers at the depths (k + 1/2) spacing. It never grows with the distance: where
+    the sum ripples deep inside the wall, its largest value farther out is kept.
+    """
+    distance = np.asarray(distance, dtype=float)
+    fine = np.linspace(-support_radius, support_radius, 8 * TABLE_STEPS + 1)
+    layers = np.arange(int(math.ceil(2.0 * support_radius / spacing)) + 1)
+    height = fine[:, None] + (layers + 0.5) * spacing
+    columns = []
+    for power in POWERS:
+        full = lattice_sum(power, support_radius, spacing, dimension)
+        terms = layer_weight(power, height, support_radius, spacing, dimension)
+        share = np.maximum.accumulate(terms.sum(axis=1)[::-1])[::-1] / full
+        columns.append(np.interp(distance, fine, share, right=0.0))
+    return np.stack(columns, axis=-1)
+
+
+def _shells(support_radius):
+    """Midpoints of thin shells around the particle [m]."""
+    return (np.arange(_QUADRATURE_STEPS) + 0.5) * (support_radius / _QUADRATURE_STEPS)
+
+
+def _shell_weights(power, r, support_radius, dimension, cylinder):
+    """Weight times measure of shells of radius r; for a cylinder of its section, summed along it."""
+    if cylinder:
+        weight = layer_weight(power, r, support_radius, 1.0, 2)
+        return weight * r
+    return (1.0 - r / support_radius) ** power * r ** (dimension - 1)
+
+
+def _share_inside(cosine, dimension):
+    """Share of a shell beyond the cone angle: of a sphere (3D) or a circle (2D)."""
+    cosine = np.clip(cosine, -1.0, 1.0)
+    return 0.5 * (1.0 - cosine) if dimension == 3 else np.arccos(cosine) / math.pi
+
+
+def flat_integral(distance, support_radius, dimension, cylinder=False):
+    """Integral of the weight over a half space at a signed distance, arbitrary unit, (..., 2)."""
+    r = _shells(support_radius)
+    section = 2 if cylinder else dimension
+    share = _share_inside(np.asarray(distance, dtype=float)[..., None] / r, section)
+    return np.stack(
+        [
+            (share * _shell_weights(p, r, support_radius, dimension, cylinder)).mean(axis=-1)
+            for p in POWERS
+        ],
+        axis=-1,
+    )
+
+
+def round_ratio(distance, radius, support_radius, dimension, cylinder=False, inverted=False):
+    """How much more or less than a flat wall a round one adds at the same signed distance, (..., 2).
+
+    Args:
+        distance: to the surface [m], negative in the material.
+        radius: of the ball or the (infinite) cylinder [m].
+        support_radius: h [m].
+        dimension: 2 or 3; a ball in 2D is a disc.
+        cylinder: an infinite cylinder instead of a ball (3D only).
+        inverted: the material is outside the ball or cylinder.
+    """
+    section = 2 if cylinder else dimension
+    last_good = _LAST_GOOD_RATIO * support_radius
+    nearest = -support_radius if inverted else -radius
+    farthest = min(last_good, radius) if inverted else last_good
+    d = np.clip(np.asarray(distance, dtype=float), nearest, farthest)
+    r = _shells(support_radius)
+    to_centre = np.maximum(radius - d if inverted else radius + d, 1e-6 * support_radius)[..., None]
+    share = _share_inside((to_centre**2 + r**2 - radius**2) / (2.0 * to_centre * r), section)
+    share = 1.0 - share if inverted else share
+    columns = [
+        (share * _shell_weights(p, r, support_radius, dimension, cylinder)).mean(axis=-1)
+        for p in POWERS
+    ]
+    return np.stack(columns, axis=-1) / flat_integral(d, support_radius, dimension, cylinder)
+
+
+class WallTables:
+    """Collects the tables a set of solids needs, each once.
+
+    Attributes:
+        full_cover: share of the rest density deep inside a wall, density and near-density, (2,).
+    """
+
+    def __init__(self, support_radius, spacing, dimension):
+        self.support_radius = support_radius
+        self.spacing = spacing
+        self.dimension = dimension
+        self._index = {}
+        self._tables = []
+        self._distances = distances(support_radius)
+        self._flat = self.flat(self._distances)
+        self.full_cover = self._flat[0].copy()
+        self._add("flat", self._flat)
+
+    def flat(self, distance):
+        """Share that a flat wall adds at the distances [m], (..., 2)."""
+        return flat_wall(distance, self.support_radius, self.spacing, self.dimension)
+
+    def ball(self, radius, inverted):
+        """Index of the table of a ball (2D: a disc) of this radius [m]."""
+        return self._round(radius, inverted, cylinder=False)
+
+    def cylinder(self, radius, inverted):
+        """Index of the table of an infinite cylinder; in 2D of the strip between its two sides."""
+        if self.dimension == 3:
+            return self._round(radius, inverted, cylinder=True)
+        near = self._flat
+        if inverted:
+            far = self.flat(2.0 * radius - self._distances)
+            share = 1.0 - (1.0 - near) * (1.0 - far)
+        else:
+            share = near - self.flat(self._distances + 2.0 * radius)
+        return self._add(("strip", radius, inverted), share)
+
+    def _round(self, radius, inverted, cylinder):
+        key = ("round", radius, inverted, cylinder)
+        if key in self._index:
+            return self._index[key]
+        ratio = round_ratio(
+            self._distances, radius, self.support_radius, self.dimension, cylinder, inverted
+        )
+        return self._add(key, np.minimum(self._flat * ratio, self.full_cover))
+
+    def _add(self, key, table):
+        if key not in self._index:
+            table[-1] = 0.0
+            self._index[key] = len(self._tables)
+            self._tables.append(table)
+        return self._index[key]
+
+    def stacked(self):
+        """All tables, (T, TABLE_STEPS + 1, 2) float32."""
+        return np.ascontiguousarray(np.stack(self._tables), dtype=np.float32)
