@@ -186,7 +186,7 @@ def two_clocks(path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["missing"], "missing: does not exist"),
+        (["hand_stri"], "hand_stri: no such bag"),
         (["{bag}", "--topics", "/nothing"], "no topic /nothing, expected one of /hand/pose"),
         (["{bag}", "--remap", "/x:=/y"], "no topic /x"),
         (["{bag}", "--remap", "/hand/pose:=/a b"], "'/a b' is not a valid topic name"),

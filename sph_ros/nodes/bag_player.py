@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import rclpy
 from rclpy.duration import Duration
@@ -213,7 +214,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
         description="Play a rosbag2 recording (sqlite3 or mcap) onto ROS 2 topics.",
         epilog="ROS arguments may follow after --ros-args.",
     )
-    parser.add_argument("bag", help="folder with metadata.yaml, or a .mcap or .db3 file")
+    parser.add_argument(
+        "bag", help="folder with metadata.yaml, .mcap or .db3 file, or a packaged bag"
+    )
     parser.add_argument(
         "--rate", type=_positive, default=1.0, metavar="R", help="times recorded speed (1)"
     )
@@ -251,7 +254,7 @@ def main(argv: list[str] | None = None) -> int:
     own_arguments, ros_arguments = split_arguments(sys.argv[1:] if argv is None else argv)
     options = parse_arguments(own_arguments)
     try:
-        with open_bag(options.bag) as bag:
+        with open_bag(_find(options.bag)) as bag:
             _play(bag, options, ros_arguments)
     except ValueError as error:  # BagError is one
         print(f"bag_player: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -283,6 +286,16 @@ def _qos(topic: Topic) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=local if topic.transient_local else volatile,
     )
+
+
+def _find(bag: str) -> Path:
+    """A path, or the path of a packaged bag; ValueError when it is neither."""
+    if Path(bag).exists():
+        return Path(bag)
+    # Loads the compiled half of the package, a second that other players need not wait.
+    from sph_ros.sim.scene import bag_path
+
+    return bag_path(bag)
 
 
 def _message_class(name: str) -> type | None:
