@@ -153,6 +153,7 @@ def march(field, grid) -> Surface:
     """Marching cubes (Lewiner et al. 2003, scikit-image) on a field, normals by its gradient.
 
     Vertices are in the world frame [m]. The field's border must be 0, so that the mesh is closed.
+    Normals are those of the field blurred once more: they show unrest long before positions do.
     """
     if field.max(initial=0.0) <= SURFACE_COLOUR:
         return _empty()
@@ -161,7 +162,9 @@ def march(field, grid) -> Surface:
     )
     nodes = np.ascontiguousarray(nodes, np.float32)
     normals = np.empty_like(nodes)
-    _field_normals(field, nodes, 1.0 / grid.cell, normals)
+    smooth = np.empty_like(field)
+    _blur_pass(field, field.shape[1] == 4, np.empty_like(field), smooth)
+    _field_normals(smooth, nodes, 1.0 / grid.cell, normals)
     vertices = ((nodes + grid.first) * grid.cell).astype(np.float32)
     return Surface(vertices, np.ascontiguousarray(triangles, np.int32), normals)
 

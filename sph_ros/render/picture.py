@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the liquid and the solids, drawn on the CPU without a display."""
+
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sph_ros.render.camera import Camera
+from sph_ros.render.light_map import floor_light
+from sph_ros.render.raster import (
+    draw_lines,
+    draw_liquid,
+    draw_solids,
+    draw_spheres,
+    projected_corners,
+    view_rays,
+)
+from sph_ros.render.walls import press_to_walls
+from sph_ros.render.water import compose
+
+#: Linear RGB of solids that have no colour of their own, in turn.
+SOLID_COLOURS = ((0.80, 0.20, 0.08), (0.85, 0.55, 0.08), (0.20, 0.45, 0.12), (0.35, 0.18, 0.50))
+
+#: Edges between faces that differ by more than this angle are outlines and keep flat shading [deg].
+CREASE_ANGLE = 35.0
+
+
+@dataclass(frozen=True)
+class SolidView:
+    """A solid as it is drawn.
+
+    Attributes:
+        name: of the solid.
+        vertices: [m], solid's frame, (V, 3).
+        triangles: indices, counter-clockwise from outside, (T, 3).
+        position: of the solid's frame in the world [m], (3,).
+        quat_xyzw: rotation from the solid's frame to the world.
+        container: drawn as outlines only; the liquid is inside.
+        color: sRGB 0 to 1, or None for one of ours.
+        wireframe: drawn as outlines although it is no container.
+    """
+
+    name: str
+    vertices: np.ndarray
+    triangles: np.ndarray
+    position: tuple = (0.0, 0.0, 0.0)
+    quat_xyzw: tuple = (0.0, 0.0, 0.0, 1.0)
+    container: bool = False
+    color: tuple | None = None
+    wireframe: bool = False
+
+    def world_vertices(self) -> np.ndarray:
+        """Vertices in the world [m], (V, 3) float64."""
+        x, y, z, w = np.asarray(self.quat_xyzw, np.float64) / np.linalg.norm(self.quat_xyzw)
+        axis, points = np.array([x, y, z]), np.asarray(self.vertices, np.float64)
+        turned = np.cross(axis, points)
+        return points + 2.0 * (w * turned + np.cross(axis, turned)) + np.asarray(self.position)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is in a picture.
+
+    Attributes:
+        positions: particles [m], world frame, (N, 3).
+        velocities: [m/s], (N, 3), or None; colours particles by speed.
+        surface: (vertices (V, 3), triangles (T, 3), normals (V, 3)) of the liquid, or None to draw
+            the particles as spheres.
+        solids: what else there is.
+        spacing: of the particles [m].
+        floor_z: height of the floor [m]; None: under everything.
+        top_speed: speed of the reddest colour [m/s]; None: the fastest particle.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray | None = None
+    surface: tuple | None = None
+    solids: list[SolidView] = field(default_factory=list)
+    spacing: float = 0.01
+    floor_z: float | None = None
+    top_speed: float | None = None
+
+    def bounds(self):
+        """Lower and upper corner of containers, liquid and finite-sized solids [m], (3,) each."""
+        points = [solid.world_vertices() for solid in self.solids if solid.container]
+        if len(self.positions):
+            inner = np.percentile(self.positions, [0.5, 99.5], axis=0)
+            points.append(inner + [[-self.spacing] * 3, [self.spacing] * 3])
+        if not points:
+            points = [solid.world_vertices() for solid in self.solids] or [np.zeros((1, 3))]
+        points = np.concatenate(points)
+        return points.min(axis=0), points.max(axis=0)
+
+
+def render(frame: Frame, camera: Camera, size=(1280, 720), supersample=2) -> np.ndarray:
+    """Picture of a frame, (height, width, 3) uint8 RGB.
+
+    Args:
+        frame: what is there.
+        camera: from where it is seen.
+        size: (width, height) in pixels.
+        supersample: samples along a pixel's edge; 1 is quick, 2 smooth.
+
+    Raises:
+        ValueError: size or supersample not positive.
+    """
+    width, height = size
+    if width < 1 or height < 1 or supersample < 1:
+        raise ValueError(f"picture: size {size}, supersample {supersample}, expected 1 or more")
+    fine = (width * supersample, height * supersample)
+    solids = _draw_opaque(frame, camera, fine)
+    surface = press_to_walls(frame.surface, frame.solids, frame.spacing)
+    liquid = _draw_liquid(surface, camera, fine, solids[0])
+    lines = _draw_outlines(frame, camera, fine, solids[0], supersample)
+    lower, upper = frame.bounds()
+    scene_size = max(float(np.linalg.norm(upper - lower)), frame.spacing)
+    lights = _lights(frame, surface, lower, upper, scene_size)
+    picture = np.empty((height, width, 3), np.uint8)
+    compose(
+        solids,
+        liquid,
+        lines,
+        view_rays(camera, fine),
+        np.array(camera.intrinsics(fine)),
+        lights,
+        np.array([scene_size, frame.spacing]),
+        supersample,
+        picture,
+    )
+    return picture
+
+
+def save_png(path, picture) -> None:
+    """Write an RGB picture (h, w, 3) uint8; the file appears whole or not at all.
+
+    Raises:
+        OSError: the folder does not exist or cannot be written.
+    """
+    path = Path(path)
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]))
+    if not done:
+        raise OSError(f"{path}: picture of shape {picture.shape} cannot be encoded as PNG")
+    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(encoded.tobytes())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def speed_colours(velocities, count, top_speed=None) -> np.ndarray:
+    """Linear RGB per particle: deep blue at rest, over cyan to white when fast, (count, 3)."""
+    if velocities is None or not count:
+        return np.full((count, 3), (0.03, 0.22, 0.60), np.float32)
+    speed = np.linalg.norm(velocities, axis=1)
+    top = max(float(speed.max()) if top_speed is None else top_speed, 1e-6)
+    stops = np.array([[0.02, 0.10, 0.45], [0.03, 0.38, 0.75], [0.25, 0.80, 0.85], [1.0, 1.0, 1.0]])
+    at = np.clip(speed / top, 0.0, 1.0)
+    columns = [np.interp(at, np.linspace(0, 1, len(stops)), stops[:, c]) for c in range(3)]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _draw_opaque(frame, camera, size):
+    """Depth (H, W) and linear RGB (H, W, 3) of solids, and of particles if there is no surface."""
+    depth = np.full(size[::-1], np.inf, np.float32)
+    picture = np.zeros((*size[::-1], 3), np.float32)
+    view = view_rays(camera, size)
+    shown = [solid for solid in frame.solids if not (solid.container or solid.wireframe)]
+    for number, solid in enumerate(shown):
+        points = solid.world_vertices()[solid.triangles]
+        corners, normals = projected_corners(points, _corner_normals(points), camera, size)
+        colour = SOLID_COLOURS[number % len(SOLID_COLOURS)]
+        if solid.color is not None:
+            colour = tuple(c**2.2 for c in solid.color[:3])
+        colours = np.tile(np.float32(colour), (len(corners), 1))
+        draw_solids(corners, normals, colours, view, depth, picture)
+    if frame.surface is None and len(frame.positions):
+        image, z = camera.project(frame.positions, size)
+        centres = np.concatenate([image, z[:, None]], axis=1).astype(np.float32)
+        colours = speed_colours(frame.velocities, len(centres), frame.top_speed)
+        focal = camera.intrinsics(size)[0]
+        draw_spheres(centres, 0.5 * frame.spacing, colours, view, focal, depth, picture)
+    return depth, picture
+
+
+def _corner_normals(points):
+    """Unit normals at triangles' corners: mean over the faces around, flat across creases.
+
+    Args:
+        points: corners [m], (T, 3, 3).
+    """
+    faces = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    flat = faces / np.maximum(np.linalg.norm(faces, axis=1), 1e-30)[:, None]
+    scale = 1e6 / max(np.abs(points).max(initial=0.0), 1e-9)
+    keys = np.round(points.reshape(-1, 3) * scale).astype(np.int64)
+    _, vertex = np.unique(keys, axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1)
+    total = np.zeros((vertex.max(initial=-1) + 1, 3))
+    np.add.at(total, vertex, np.repeat(faces, 3, axis=0))
+    total /= np.maximum(np.linalg.norm(total, axis=1), 1e-30)[:, None]
+    smooth, face = total[vertex].reshape(-1, 3, 3), np.repeat(flat[:, None], 3, axis=1)
+    crease = (smooth * face).sum(axis=2) < np.cos(np.radians(CREASE_ANGLE))
+    return np.where(crease[..., None], face, smooth).astype(np.float32)
+
+
+def _draw_liquid(surface, camera, size, solid_depth):
+    """Front and back (H, W, 4) and thickness (H, W) of the liquid's surface."""
+    front = np.zeros((*size[::-1], 4), np.float32)
+    front[..., 0] = np.inf
+    back, thickness = np.zeros_like(front), np.zeros_like(solid_depth)
+    if surface is not None and len(surface[1]):
+        vertices, triangles, normals = surface
+        corners, normals = projected_corners(
+            np.asarray(vertices, np.float64)[triangles], normals[triangles], camera, size
+        )
+        draw_liquid(corners, normals, solid_depth, front, back, thickness)
+    return front, back, thickness
+
+
+def _draw_outlines(frame, camera, size, solid_depth, supersample):
+    """Cover of outlines that the camera sees through the solid, and of those on its near side."""
+    covers = np.zeros((2, *size[::-1]), np.uint8)
+    for solid in frame.solids:
+        if not (solid.container or solid.wireframe):
+            continue
+        ends, near = _outlines(solid, camera)
+        for number, cover in enumerate(covers):
+            chosen = ends[near == bool(number)]
+            if len(chosen):
+                clipped = np.concatenate([chosen, chosen[:, 1:]], axis=1)
+                corners, _ = projected_corners(clipped, np.zeros_like(clipped), camera, size)
+                line = np.ascontiguousarray(corners[:, :2])
+                draw_lines(line, 0.75 * supersample, solid_depth, 2.0 * frame.spacing, cover)
+    return covers[0], covers[1]
+
+
+def _outlines(solid, camera):
+    """Ends of creases and silhouettes (L, 2, 3) [m], and whether each is on the camera's side."""
+    points = solid.world_vertices()
+    triangles = np.asarray(solid.triangles, np.int64)
+    _, first, same = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
+    triangles = first[same.reshape(-1)][triangles]
+    faces = np.cross(
+        points[triangles[:, 1]] - points[triangles[:, 0]],
+        points[triangles[:, 2]] - points[triangles[:, 0]],
+    )
+    faces /= np.maximum(np.linalg.norm(faces, axis=1), 1e-30)[:, None]
+    seen = np.einsum("ij,ij->i", faces, camera.eye - points[triangles[:, 0]]) > 0.0
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    order = np.lexsort(edges.T)
+    edges, owner = edges[order], owner[order]
+    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
+    one, other = owner[pair], owner[pair + 1]
+    crease = np.einsum("ij,ij->i", faces[one], faces[other]) < np.cos(np.radians(CREASE_ANGLE))
+    drawn = crease | (seen[one] != seen[other])
+    return points[edges[pair[drawn]]], (seen[one] | seen[other])[drawn]
+
+
+def _lights(frame, surface, lower, upper, scene_size):
+    """Room and light map for `compose`."""
+    floor_z = lower[2] if frame.floor_z is None else frame.floor_z
+    opaque = [s for s in frame.solids if not (s.container or s.wireframe)]
+    solids = [solid.world_vertices()[solid.triangles] for solid in opaque]
+    solids = np.concatenate(solids) if solids else np.zeros((0, 3, 3))
+    particles = frame.positions if frame.surface is None else frame.positions[:0]
+    light, origin, scale = floor_light(
+        surface,
+        solids,
+        np.ascontiguousarray(particles, np.float32),
+        0.5 * frame.spacing,
+        floor_z,
+        lower,
+        upper,
+    )
+    centre = 0.5 * (lower + upper)
+    tile = scene_size / 8.0
+    room = np.array(
+        [floor_z, tile, 5.0 * scene_size, origin[0], origin[1], scale, centre[0], centre[1]]
+    )
+    return room, light
