@@ -180,11 +180,12 @@ def test_anchors_and_merge_keys_work(tmp_path):
 
 
 def test_meshes_are_relative_to_their_scene_file(tmp_path, monkeypatch):
-    trimesh = pytest.importorskip("trimesh")
-    trimesh.creation.box((0.02, 0.02, 0.02)).export(tmp_path / "cube.stl")
+    import trimesh
+
+    trimesh.creation.box((0.08, 0.08, 0.08)).export(tmp_path / "cube.stl")
     file = tmp_path / "scene.yaml"
     file.write_text(
-        GOOD + "  - {name: cube, mesh: {file: cube.stl}, pose: {position: [0.18, 0.05, 0.18]}}\n"
+        GOOD + "  - {name: cube, mesh: {file: cube.stl}, pose: {position: [0.15, 0.05, 0.15]}}\n"
     )
     monkeypatch.chdir("/")
     assert load_scene(file).solids[2].shape == Mesh(str(tmp_path / "cube.stl"))

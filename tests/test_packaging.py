@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What colcon, pip and people read about the package says the same everywhere."""
+
+import importlib
+import re
+import xml.etree.ElementTree
+from pathlib import Path
+
+import pytest
+
+from sph_ros.sim.share import share_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")
+MANIFEST = xml.etree.ElementTree.parse(ROOT / "package.xml").getroot()
+PROGRAMS = dict(re.findall(r'"(\w+) = ([\w.]+):main"', SETUP))
+
+
+def version_in_setup():
+    return re.search(r'version="([\d.]+)"', SETUP)[1]
+
+
+def test_versions_agree():
+    changelog = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    newest = re.search(r"^(\d+\.\d+\.\d+) \(", changelog, re.MULTILINE)[1]
+    assert version_in_setup() == MANIFEST.findtext("version") == newest
+
+
+def test_package_xml_is_valid():
+    assert MANIFEST.get("format") == "3"
+    assert MANIFEST.findtext("name") == "sph_ros"
+    assert MANIFEST.findtext("export/build_type") == "ament_python"
+    try:
+        from catkin_pkg.package import parse_package
+    except ImportError:
+        return  # present wherever colcon is; what stands above holds without it
+    parse_package(str(ROOT / "package.xml")).validate()
+
+
+def test_every_program_can_be_imported():
+    assert {"fluid_node", "bag_player", "web_viewer", "sph_ros"} <= set(PROGRAMS)
+    for module in PROGRAMS.values():
+        if ".nodes." in module:
+            pytest.importorskip("rclpy", reason="ROS is not installed: rclpy cannot be imported")
+        assert callable(importlib.import_module(module).main)
+
+
+def test_ros_comes_from_the_extra_only():
+    required = re.search(r"install_requires=\[(.*?)\]", SETUP, re.DOTALL)[1]
+    assert "ros-jazzy" not in required and "rclpy" not in required
+    pinned = re.findall(r'"(ros-jazzy-[\w-]+==[\d.]+)"', SETUP)
+    constraints = (ROOT / "constraints.txt").read_text(encoding="utf-8").split()
+    assert len(pinned) == 3 and set(pinned) <= set(constraints)
+
+
+def test_every_message_package_that_nodes_import_is_a_dependency():
+    declared = {element.text for element in MANIFEST.findall("exec_depend")}
+    sources = [*(ROOT / "sph_ros").rglob("*.py"), *(ROOT / "msg_adapters").rglob("*.py")]
+    pattern = re.compile(r"^\s*from (\w+_(?:msgs|interfaces|srvs))\.\w+ import", re.MULTILINE)
+    for path in sources:
+        for package in pattern.findall(path.read_text(encoding="utf-8")):
+            assert package in declared, f"{path.name} imports {package}"
+
+
+def test_the_code_finds_the_files_that_belong_to_it():
+    folder = share_folder()
+    assert (folder / "package.xml").is_file()
+    assert (folder / "scenes" / "ball_tank.yaml").is_file()
