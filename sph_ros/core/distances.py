@@ -48,9 +48,10 @@ class PackedShapes(NamedTuple):
         node_op: SPHERE ... INTERSECTION, (N,).
         node_sign: +1, or -1 for an inverted leaf, (N,).
         node_transform: rows of [M | b], leaf point = M solid point + b, (N, 3, 4).
-        node_size: SPHERE radius; BOX half sizes; CAPSULE, CYLINDER radius, half length; the PLANE is
-            z = 0 of its frame [m], (N, 3).
-        node_table: wall tables of a leaf: around (ball, cylinder, strip) and a capsule's ends, (N, 2).
+        node_size: SPHERE radius; BOX half sizes; CAPSULE, CYLINDER radius, half length; a PLANE
+            is z = 0 of its frame [m], (N, 3).
+        node_table: wall tables of a leaf: round side (ball, cylinder, strip), a capsule's
+            ends, (N, 2).
         node_grid: distance grid of a leaf, or -1, (N,).
         tables: wall shares over distance, see `wall_tables`, (T, rows, 2).
         grid_origin: position of the first sample in the leaf's frame [m], (G, 3).
@@ -181,7 +182,7 @@ def cylinder_distance(radius, half_length, x, y, z):
 
 @inlined
 def grid_place(shapes, grid, axis, coordinate):
-    """Where a coordinate falls on a grid's axis: cell index, place in it (0 ... 1), overshoot [m]."""
+    """Where a coordinate falls on a grid's axis: cell, place in it (0 ... 1), overshoot [m]."""
     cell = shapes.grid_cell[grid]
     last = shapes.grid_shape[grid, axis] - 1
     u = (coordinate - shapes.grid_origin[grid, axis]) / cell

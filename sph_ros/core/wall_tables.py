@@ -83,7 +83,7 @@ def _shells(support_radius):
 
 
 def _shell_weights(power, r, support_radius, dimension, cylinder):
-    """Weight times measure of shells of radius r; for a cylinder of its section, summed along it."""
+    """Weight times measure of shells of radius r; for a cylinder of a section, summed along."""
     if cylinder:
         weight = layer_weight(power, r, support_radius, 1.0, 2)
         return weight * r
@@ -111,7 +111,7 @@ def flat_integral(distance, support_radius, dimension, cylinder=False):
 
 
 def round_ratio(distance, radius, support_radius, dimension, cylinder=False, inverted=False):
-    """How much more or less than a flat wall a round one adds at the same signed distance, (..., 2).
+    """How much more or less than a flat wall a round one adds at one distance, (..., 2).
 
     Args:
         distance: to the surface [m], negative in the material.

@@ -16,6 +16,7 @@ of the tables' linear interpolants and of the grids' trilinear ones.
 """
 
 import numpy as np
+from numba import prange
 
 from sph_ros.core.distances import (
     BOX,
@@ -37,6 +38,7 @@ from sph_ros.core.distances import (
     to_leaf,
     trilinear,
 )
+from sph_ros.core.jit import parallel_kernel
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -46,7 +48,7 @@ _FLAT = 0
 
 @inlined
 def wall_share(shapes, table, distance):
-    """Share of density and near-density at a distance, each with its slope [1/m]: (f, f', g, g')."""
+    """Shares of density and near-density at a distance and their slopes [1/m]: (f, f', g, g')."""
     rows = shapes.tables
     last = rows.shape[1] - 1
     place = (distance + shapes.support_radius) * shapes.table_scale
@@ -331,3 +333,19 @@ def wall_terms(shapes, solid, x, y, z):
     nx, ny, nz = leaf_normal(shapes, node, fx, fy, fz)
     t = solid_terms(shapes, solid, fx, fy, fz)
     return d, nx, ny, nz, t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7]
+
+
+@parallel_kernel
+def wall_terms_at(shapes, solid, points, terms):  # the last one is written
+    """`wall_terms` of one solid at many points.
+
+    Args:
+        shapes: PackedShapes.
+        solid: index of the solid.
+        points: in the solid's frame [m], (M, 3) float32.
+        terms: (M, 12) float32.
+    """
+    for i in prange(points.shape[0]):
+        found = wall_terms(shapes, solid, points[i, 0], points[i, 1], points[i, 2])
+        for column in range(12):
+            terms[i, column] = found[column]

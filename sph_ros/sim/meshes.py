@@ -3,8 +3,9 @@
 
 A mesh need not be watertight. It is refused when its surface does not say what is inside: points
 just above and just below the surface are sampled, and more than `AMBIGUOUS_LIMIT` of them have a
-generalized winding number that is neither near 0 nor near a whole body (0.25 < |w| < 0.75). Holes
-of an accepted mesh are closed by fans of triangles around their middles, with a warning.
+generalized winding number that is neither near 0 nor near a whole body (0.25 < |w| < 0.75). It is
+also refused when closing one hole takes more than `HOLE_LIMIT` of its area: a cup that is a single
+sheet is no body. Other holes are closed by fans of triangles around their middles, with a warning.
 """
 
 import hashlib
@@ -28,6 +29,8 @@ from sph_ros.sim.shape_types import Mesh
 
 #: Share of samples beside the surface that may be neither clearly inside nor clearly outside.
 AMBIGUOUS_LIMIT = 0.05
+#: Largest hole that is closed, as a share of the area of the mesh.
+HOLE_LIMIT = 0.15
 #: Nodes of a distance grid at most; beyond, its cells are larger than half the particle spacing.
 MAX_GRID_NODES = 128**3
 #: Triangles of a mesh at most: ten times what can be sampled within a minute.
@@ -211,7 +214,7 @@ def _load_surface(path: Path, scale: float, stamp: int) -> Surface:
     triangles = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
     _check_arrays(path, vertices, triangles)
     vertices, triangles = _merged(vertices[np.unique(triangles)] * scale, _compact(triangles))
-    if len(triangles) == 0 or not np.ptp(vertices, axis=0).max() > 0.0:
+    if not _areas(vertices[triangles]).sum() > 1e-12 * np.ptp(vertices, axis=0).max() ** 2:
         raise MeshError(f"{path}: contains no triangles with an area")
     edges, mixed = _open_edges(triangles)
     if mixed:
@@ -225,9 +228,36 @@ def _load_surface(path: Path, scale: float, stamp: int) -> Surface:
             f"{100 * AMBIGUOUS_LIMIT:.0f} %"
         )
     if len(edges):
-        _LOG.warning("%s: not watertight, closed the holes of %d open edges", path, len(edges))
-        vertices, triangles = _close_holes(vertices, triangles, edges)
+        vertices, triangles = _closed(path, vertices, triangles, edges)
     return Surface(vertices, _outward(vertices, triangles), len(edges))
+
+
+def _closed(path: Path, vertices, triangles, edges) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its holes closed, or MeshError if one of them is too large."""
+    count = len(triangles)
+    closed_vertices, closed = _close_holes(vertices, triangles, edges)
+    area = _areas(closed_vertices[closed])
+    hole = closed[count:, 2] - len(vertices)
+    holes = np.bincount(hole, weights=area[count:]) / area[:count].sum()
+    if holes.max() > HOLE_LIMIT:
+        raise MeshError(
+            f"{path}: does not enclose a body: {len(edges)} open edges, the largest hole has "
+            f"{100 * holes.max():.0f} % of the surface's area; expected a watertight mesh or "
+            f"holes of at most {100 * HOLE_LIMIT:.0f} %"
+        )
+    _LOG.warning(
+        "%s: not watertight, closed the holes of %d open edges (%.1f %% of the surface)",
+        path,
+        len(edges),
+        100 * holes.sum(),
+    )
+    return closed_vertices, closed
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """Areas of triangles given by their corners (T, 3, 3)."""
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * np.linalg.norm(vectors, axis=1)
 
 
 def _outward(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -299,7 +329,7 @@ def _support_stencil(support_radius: float, cell: float):
 
 
 def _flat_sums(offsets, weights, cell, support_radius):
-    """`cover_sums` of flat walls over their distance, mean over many directions: (d, sums (D, 2))."""
+    """`cover_sums` of flat walls over their distance, mean over directions: (d, sums (D, 2))."""
     distance = np.linspace(-support_radius, support_radius, 129)
     index = np.arange(64) + 0.5  # Fibonacci directions
     z, turn = 1.0 - index / 32.0, index * np.pi * (1.0 + 5.0**0.5)
