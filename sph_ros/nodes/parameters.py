@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the fluid node: declared once, described, ranged; checked first, applied later."""
+
+import math
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+
+from sph_ros.sim.materials import RANGES, Material, changed
+
+STEP_MODES = ("realtime", "clock", "lockstep")
+
+MATERIAL_PREFIX = "material."
+
+#: How far simulated time may lag before the lag is forgotten, by step mode [s]. A /clock may tick
+#: slowly, and each tick then asks for all of its time at once.
+DEFAULT_CATCH_UP = {"realtime": 0.1, "clock": 1.0, "lockstep": 0.1}
+
+MATERIAL_TEXTS = {
+    "density": "rest density [kg/m^3]",
+    "viscosity": "dynamic viscosity [Pa s]",
+    "surface_tension": "surface tension against air [N/m]",
+    "compression": "relative compression allowed at the deepest point at rest [-]",
+    "wall_friction": "0 lets the liquid slip along solids, 1 drags it with them [-]",
+    "adhesion": "how strongly solids hold the liquid, as a share of its own cohesion [-]",
+    "quadratic_viscosity": "damps pairs that collide fast (Clavet's beta times the spacing) [-]",
+}
+
+
+class ParameterError(ValueError):
+    """A parameter cannot be used; one line that says why."""
+
+
+class Settings:
+    """The parameters of a fluid node.
+
+    `declare_fixed` first: the scene that it names has the defaults of the live ones.
+
+    Args:
+        node: that gets the parameters.
+    """
+
+    def __init__(self, node):
+        self._node = node
+        self._apply = None
+
+    def declare_fixed(self):
+        """Declare what needs a restart to change; returns (scene, step_mode)."""
+        scene = self._declare(
+            "scene",
+            "ball_tank",
+            "scene: packaged name or path of a YAML file",
+            read_only=True,
+        )
+        step_mode = self._declare(
+            "step_mode",
+            "realtime",
+            "what drives simulated time: realtime (this machine's clock), clock (the ROS clock, "
+            "/clock with use_sim_time), lockstep (every pose message: one publication period)",
+            read_only=True,
+            additional_constraints=f"one of {', '.join(STEP_MODES)}",
+        )
+        if step_mode not in STEP_MODES:
+            raise ParameterError(
+                f"parameter step_mode: expected one of {', '.join(STEP_MODES)}, got {step_mode!r}"
+            )
+        return scene, step_mode
+
+    def declare_live(self, material, step_mode):
+        """Declare what may change while the node runs; defaults from the scene's material."""
+        number = self._declare_number
+        number("publish_rate", 30.0, 0.1, 1000.0, "publications per second [Hz]; see step_mode")
+        number("surface_rate", 15.0, 0.1, 1000.0, "surfaces per second, at most [Hz]")
+        number("speed", 1.0, 0.01, 100.0, "simulated per real time, in realtime mode [-]")
+        number(
+            "max_catch_up",
+            DEFAULT_CATCH_UP[step_mode],
+            0.0,
+            60.0,
+            "simulated time may lag so far behind before the lag is forgotten [s]",
+        )
+        number(
+            "smoothing_time",
+            0.05,
+            0.0,
+            1.0,
+            "a solid reaches a new pose after the time between poses, but after so long at most "
+            "[s]; 0: within one time step",
+        )
+        for field, (low, high) in RANGES.items():
+            text = MATERIAL_TEXTS.get(field, field.replace("_", " "))
+            number(MATERIAL_PREFIX + field, getattr(material, field), low, high, text)
+
+    def follow(self, apply):
+        """From now on check every change, and call `apply(names)` after each that was accepted."""
+        self._apply = apply
+        self._node.add_on_set_parameters_callback(self._check)
+        self._node.add_post_set_parameters_callback(self._applied)
+
+    def __getitem__(self, name):
+        """Present value of a parameter."""
+        return self._node.get_parameter(name).value
+
+    def material(self):
+        """Present values of all fields of the material."""
+        return {field: within_range(field, self[MATERIAL_PREFIX + field]) for field in RANGES}
+
+    def _declare_number(self, name, default, low, high, text):
+        value = self._declare(
+            name,
+            float(default),
+            text,
+            floating_point_range=[FloatingPointRange(from_value=float(low), to_value=float(high))],
+        )
+        if not math.isfinite(value):
+            raise ParameterError(f"parameter {name}: expected {low:g} to {high:g}, got {value}")
+
+    def _declare(self, name, default, description, **descriptor):
+        descriptor = ParameterDescriptor(name=name, description=description, **descriptor)
+        try:
+            return self._node.declare_parameter(name, default, descriptor).value
+        except InvalidParameterTypeException as error:
+            raise ParameterError(
+                f"parameter {name}: expected {_type_name(default)}, {error}"
+            ) from error
+        except InvalidParameterValueException as error:
+            limits = "".join(
+                f", expected {limit.from_value:g} to {limit.to_value:g}"
+                for limit in descriptor.floating_point_range
+            )
+            raise ParameterError(f"parameter {name}: {error}{limits}") from error
+
+    def _check(self, parameters):
+        """Refuse a material that cannot be; rclpy has checked types and ranges. Changes nothing."""
+        values = self.material()
+        for parameter in parameters:
+            field = parameter.name.removeprefix(MATERIAL_PREFIX)
+            if parameter.name.startswith(MATERIAL_PREFIX) and field in values:
+                values[field] = within_range(field, parameter.value)
+        try:
+            changed(Material(), **values)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=f"{MATERIAL_PREFIX}{error}")
+        return SetParametersResult(successful=True)
+
+    def _applied(self, parameters):
+        self._apply([parameter.name for parameter in parameters])
+
+
+def within_range(field, value):
+    """The value; at a bound where rclpy's tolerance let it slip over by a rounding error."""
+    low, high = RANGES[field]
+    for bound in (low, high):
+        if math.isclose(value, bound, rel_tol=1e-6):
+            return bound
+    return value
+
+
+def _type_name(value):
+    return "a number with a decimal point" if isinstance(value, float) else "text"
