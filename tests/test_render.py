@@ -4,14 +4,13 @@
 import numpy as np
 import pytest
 
-from sph_ros.core.surface import extract_surface
 from sph_ros.render import Camera, Frame, SolidView, render, save_png
 from sph_ros.render.light_map import floor_light
 from sph_ros.render.optics import WATER_INDEX, fresnel, reflect, refract
 from sph_ros.render.picture import _draw_liquid
 from sph_ros.render.plots import plot_history
 from sph_ros.render.video import VideoWriter
-from sph_ros.render.walls import press_to_walls
+from sph_ros.render.walls import convex_planes
 
 SIZE = (160, 120)
 NO_PARTICLES = np.zeros((0, 3), np.float32)
@@ -168,9 +167,7 @@ def test_solid_in_the_water_is_seen_and_is_bluer_when_deeper():
     def red_over_blue(depth):
         camera = Camera.look_at((0.2, 0.2, 1.5), (0.2, 0.2, 0.0), 20.0)
         vertices, triangles = box_mesh([0, 0, 0], [0.4, 0.4, 0.3])
-        water = press_to_walls(
-            (vertices, triangles, np.tile(np.float32([0, 0, 1]), (8, 1))), [], 0.01
-        )
+        water = (vertices, triangles, np.tile(np.float32([0, 0, 1]), (8, 1)))
         inside = ball("ball", (0.2, 0.2, 0.3 - depth), 0.06, (1.0, 1.0, 1.0))
         particles = vertices.astype(np.float32)
         picture = render(Frame(particles, None, water, [inside], 0.01, 0.0), camera, SIZE)
@@ -207,21 +204,18 @@ def test_ball_casts_a_shadow_of_its_size():
     assert area == pytest.approx(np.pi * 0.1**2 / 0.886, rel=0.03)  # over the lamp's cosine
 
 
-def test_water_at_a_wall_is_pressed_flat():
-    rng = np.random.default_rng(0)
-    axes = [(np.arange(n) + 0.5) * 0.01 for n in (16, 16, 10)]
-    particles = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    particles += rng.normal(0.0, 0.001, particles.shape)
-    surface = extract_surface(particles, 0.01)
-    tank = SolidView("tank", *box_mesh([0, 0, 0], [0.16, 0.16, 0.3]), container=True)
-    pressed = press_to_walls(surface, [tank], 0.01)
-    at_wall = (surface.normals[:, 0] > 0.9) & (np.abs(surface.vertices[:, 2] - 0.05) < 0.03)
-    at_wall &= np.abs(surface.vertices[:, 1] - 0.08) < 0.06
-    assert at_wall.sum() > 30
-    assert np.ptp(pressed[0][at_wall, 0]) < 1e-4 < np.ptp(surface.vertices[at_wall, 0])
-    assert pressed[2][at_wall] == pytest.approx(np.tile([1, 0, 0], (at_wall.sum(), 1)), abs=0.1)
-    top = (surface.normals[:, 2] > 0.99) & (np.abs(surface.vertices[:, :2] - 0.08) < 0.05).all(1)
-    assert np.array_equal(pressed[0][top], surface.vertices[top])
+def test_planes_of_a_box_in_any_pose():
+    half_turn = (0, 0, np.sqrt(0.5), np.sqrt(0.5))
+    solid = SolidView("tank", *box_mesh([0, 0, 0], [1, 2, 3]), (0.5, 0, 0), half_turn, True)
+    planes = convex_planes(solid)
+    assert len(planes) == 6
+    inside = np.array([-1.0, 0.5, 1.5])  # turned a quarter about z: x in -1.5..0.5, y in 0..1
+    assert np.sort(planes[:, 3] - planes[:, :3] @ inside) == pytest.approx(
+        [0.5, 0.5, 0.5, 1.5, 1.5, 1.5]
+    )
+    dented = SolidView("l", *sphere_mesh(1.0), container=True)
+    dented.vertices[600] *= 0.5
+    assert len(convex_planes(dented)) == 0
 
 
 def test_particles_are_drawn_in_the_colour_of_their_speed():

@@ -47,6 +47,9 @@ BLUR_VARIANCE = 0.5
 DENSE_NODES = 1 << 18
 DENSE_NODES_PER_PARTICLE = 24
 
+#: Liquid this near to a wall is mirrored behind it [spacings].
+WALL_REACH = 2.2
+
 #: No grid is larger (float32: 64 MB, and as much again for the blur).
 MAX_NODES = 1 << 24
 
@@ -81,7 +84,7 @@ class Surface(NamedTuple):
 
 
 def extract_surface(
-    positions, spacing, support_radius=None, cell_size=None, dimension=3
+    positions, spacing, support_radius=None, cell_size=None, dimension=3, walls=None
 ) -> Surface:
     """Closed triangle mesh around the liquid, triangles counter-clockwise seen from outside.
 
@@ -93,6 +96,9 @@ def extract_surface(
             times as much and rounds small drops.
         dimension: 3, or 2 for a liquid in the x-z plane, which becomes a slab one spacing thick
             around y = 0.
+        walls: planes of a convex container, (P, 4): outward unit normal and offset [m]; the liquid
+            is where normal . x < offset. Liquid that touches one is then flat along it, with sharp
+            edges, instead of round and half a spacing away. None for no such planes.
 
     Returns:
         Surface; with empty arrays when there are no particles.
@@ -106,6 +112,11 @@ def extract_surface(
     positions = _checked(positions, spacing, support_radius, cell_size, dimension)
     if len(positions) == 0:
         return _empty()
+    if walls is not None and len(walls):
+        walls = np.asarray(walls, np.float32)
+        mirrored = _mirrored_at_walls(positions, walls, WALL_REACH * spacing)
+        mesh = extract_surface(mirrored, spacing, support_radius, cell_size, dimension)
+        return _cut_at_walls(mesh, walls)
     grid = _grid_around(positions, spacing, support_radius, cell_size, dimension)
     node_count = np.prod(np.asarray(grid.shape, np.float64))
     if node_count <= max(DENSE_NODES, DENSE_NODES_PER_PARTICLE * len(positions)):
@@ -283,6 +294,41 @@ def _mesh_of_cluster(positions, spacing, support_radius, cell_size, dimension) -
         if np.prod(np.asarray(grid.shape, np.float64)) <= MAX_NODES:
             return _mesh_of_box(positions, grid, spacing, support_radius, dimension)
         cell_size = 2.0 * cell_size
+
+
+def _mirrored_at_walls(positions, walls, reach):
+    """Particles and their mirror images behind each wall nearer than `reach`, corners included."""
+    for wall in walls:
+        gap = wall[3] - positions @ wall[:3]
+        near = (gap > 0.0) & (gap < reach)
+        images = positions[near] + 2.0 * gap[near, None] * wall[:3]
+        positions = np.concatenate([positions, images.astype(np.float32)])
+    return np.ascontiguousarray(positions)
+
+
+def _cut_at_walls(mesh, walls) -> Surface:
+    """Move what is behind a wall onto it, and drop what is behind it altogether."""
+    vertices, normals = mesh.vertices.copy(), mesh.normals.copy()
+    count = len(vertices)
+    pairs = coo_matrix(
+        (
+            np.ones(2 * len(mesh.triangles), np.int8),
+            mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T,
+        ),
+        (count, count),
+    )
+    piece_count, piece = connected_components(pairs, directed=False)
+    kept = np.ones(piece_count, bool)
+    for wall in walls:
+        over = mesh.vertices @ wall[:3] - wall[3]
+        kept &= np.bincount(piece, over < 0.0, piece_count) > 0
+        behind = over > 0.0
+        vertices -= np.maximum(vertices @ wall[:3] - wall[3], 0.0)[:, None] * wall[:3]
+        normals[behind] = wall[:3]
+    used = kept[piece]
+    index = np.cumsum(used, dtype=np.int32) - 1
+    triangles = index[mesh.triangles[used[mesh.triangles[:, 0]]]]
+    return Surface(vertices[used], np.ascontiguousarray(triangles), normals[used])
 
 
 def _joined(parts) -> Surface:

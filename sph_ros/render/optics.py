@@ -94,19 +94,27 @@ def light_at(x, y, light, origin_x, origin_y, texels_per_metre):
 
 
 @device
-def floor_colour(x, y, tile, light, origin_x, origin_y, texels_per_metre):
-    """Linear RGB of the tiled floor with the lamp's light on it."""
-    fx, fy = x / tile - np.floor(x / tile), y / tile - np.floor(y / tile)
-    dark = (int(np.floor(x / tile)) + int(np.floor(y / tile))) % 2 != 0
-    joint = min(min(fx, 1.0 - fx), min(fy, 1.0 - fy)) < 0.012
-    shade = 0.30 if joint else (0.50 if dark else 0.74)
+def _stripes(x, blur):
+    """Square wave -1, 1 that changes sign at integers, averaged over about `blur`."""
+    wave = 1.0 - 2.0 * abs(0.5 * (x + 0.5) - np.floor(0.5 * (x + 0.5)) - 0.5) * 2.0
+    return min(max(wave / max(2.0 * blur, 1e-6), -1.0), 1.0)
+
+
+@device
+def floor_colour(x, y, tile, light, origin_x, origin_y, texels_per_metre, blur):
+    """Linear RGB of the tiled floor in the lamp's light; `blur` is a pixel's width there [m]."""
+    u, v, blur = x / tile, y / tile, blur / tile
+    shade = 0.64 + 0.085 * _stripes(u, blur) * _stripes(v, blur)
+    joint = min(abs(u - np.round(u)), abs(v - np.round(v)))
+    width = max(blur, 0.012)
+    shade *= 1.0 - 0.45 * (0.012 / width) * max(1.0 - joint / width, 0.0)
     lamp = light_at(x, y, light, origin_x, origin_y, texels_per_metre)
     lit = shade * (SKY_LIGHT + LAMP_LIGHT * lamp)
     return lit * 0.985, lit * 0.97, lit * 0.93
 
 
 @device
-def room_colour(ox, oy, oz, dx, dy, dz, room, light):
+def room_colour(ox, oy, oz, dx, dy, dz, room, light, far):
     """Linear RGB that a ray from o in direction d sees: the floor, fading into haze, or the sky.
 
     Args:
@@ -117,8 +125,9 @@ def room_colour(ox, oy, oz, dx, dy, dz, room, light):
         dy: y.
         dz: z.
         room: floor height, tile edge, haze distance [m]; light map's origin x, y [m] and texels per
-            metre, then centre x, y of the scene, (8,).
+            metre, centre x, y of the scene [m], angle of a pixel [rad], (9,).
         light: lamp light on the floor, (nx, ny).
+        far: length of the ray's way to o, for the width of a pixel [m].
     """
     if dz > -1e-4:
         return sky_colour(dx, dy, dz)
@@ -126,7 +135,8 @@ def room_colour(ox, oy, oz, dx, dy, dz, room, light):
     if along < 0.0:
         along = 0.0
     x, y = ox + along * dx, oy + along * dy
-    r, g, b = floor_colour(x, y, room[1], light, room[3], room[4], room[5])
+    blur = room[8] * (far + along) / np.sqrt(-dz)
+    r, g, b = floor_colour(x, y, room[1], light, room[3], room[4], room[5], blur)
     away = np.sqrt((x - room[6]) ** 2 + (y - room[7]) ** 2)
     haze = smooth_step(0.12, 1.0, away / room[2])
     hr, hg, hb = sky_colour(1.0, 0.0, 0.0)

@@ -19,7 +19,7 @@ from sph_ros.render.raster import (
     projected_corners,
     view_rays,
 )
-from sph_ros.render.walls import press_to_walls
+from sph_ros.render.walls import surface_at_walls
 from sph_ros.render.water import compose
 
 #: Linear RGB of solids that have no colour of their own, in turn.
@@ -69,11 +69,12 @@ class Frame:
         positions: particles [m], world frame, (N, 3).
         velocities: [m/s], (N, 3), or None; colours particles by speed.
         surface: (vertices (V, 3), triangles (T, 3), normals (V, 3)) of the liquid, or None to draw
-            the particles as spheres.
+            the particles as spheres. At the walls of a container it is remade from the particles.
         solids: what else there is.
         spacing: of the particles [m].
         floor_z: height of the floor [m]; None: under everything.
-        top_speed: speed of the reddest colour [m/s]; None: the fastest particle.
+        top_speed: speed of the brightest colour [m/s]; None: the fastest particle.
+        dimension: 3, or 2 for a liquid in the x-z plane, which is then tinted as if it were deep.
     """
 
     positions: np.ndarray
@@ -83,6 +84,7 @@ class Frame:
     spacing: float = 0.01
     floor_z: float | None = None
     top_speed: float | None = None
+    dimension: int = 3
 
     def bounds(self):
         """Lower and upper corner of containers, liquid and finite-sized solids [m], (3,) each."""
@@ -113,12 +115,12 @@ def render(frame: Frame, camera: Camera, size=(1280, 720), supersample=2) -> np.
         raise ValueError(f"picture: size {size}, supersample {supersample}, expected 1 or more")
     fine = (width * supersample, height * supersample)
     solids = _draw_opaque(frame, camera, fine)
-    surface = press_to_walls(frame.surface, frame.solids, frame.spacing)
+    surface = surface_at_walls(frame)
     liquid = _draw_liquid(surface, camera, fine, solids[0])
     lines = _draw_outlines(frame, camera, fine, solids[0], supersample)
     lower, upper = frame.bounds()
     scene_size = max(float(np.linalg.norm(upper - lower)), frame.spacing)
-    lights = _lights(frame, surface, lower, upper, scene_size)
+    lights = _lights(frame, surface, lower, upper, scene_size, 1.0 / camera.intrinsics(size)[0])
     picture = np.empty((height, width, 3), np.uint8)
     compose(
         solids,
@@ -127,7 +129,7 @@ def render(frame: Frame, camera: Camera, size=(1280, 720), supersample=2) -> np.
         view_rays(camera, fine),
         np.array(camera.intrinsics(fine)),
         lights,
-        np.array([scene_size, frame.spacing]),
+        np.array([scene_size, frame.spacing, 0.5 * scene_size * (frame.dimension == 2)]),
         supersample,
         picture,
     )
@@ -263,7 +265,7 @@ def _outlines(solid, camera):
     return points[edges[pair[drawn]]], (seen[one] | seen[other])[drawn]
 
 
-def _lights(frame, surface, lower, upper, scene_size):
+def _lights(frame, surface, lower, upper, scene_size, pixel_angle):
     """Room and light map for `compose`."""
     floor_z = lower[2] if frame.floor_z is None else frame.floor_z
     opaque = [s for s in frame.solids if not (s.container or s.wireframe)]
@@ -280,8 +282,8 @@ def _lights(frame, surface, lower, upper, scene_size):
         upper,
     )
     centre = 0.5 * (lower + upper)
-    tile = scene_size / 8.0
+    tile = scene_size / 6.0
     room = np.array(
-        [floor_z, tile, 5.0 * scene_size, origin[0], origin[1], scale, centre[0], centre[1]]
+        [floor_z, tile, 5.0 * scene_size, *origin, scale, centre[0], centre[1], pixel_angle]
     )
     return room, light

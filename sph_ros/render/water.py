@@ -23,10 +23,10 @@ from sph_ros.render.raster import pixel_ray
 
 #: Absorption per scene size and colour: as in a deep pool, for water's own colour would not show in
 #: a tank of some decimetres.
-ABSORPTION = (3.0, 0.85, 0.45)
+ABSORPTION = (3.6, 0.95, 0.40)
 
 #: Colour of the light that the body of the water scatters back.
-BODY = (0.03, 0.20, 0.27)
+BODY = (0.02, 0.17, 0.28)
 
 
 @parallel_kernel
@@ -39,8 +39,8 @@ def compose(solids, liquid, lines, view, focal, lights, lengths, supersample, pi
         lines: cover of outlines behind and before the liquid, (H, W) uint8 each.
         view: of `view_rays` for the fine image, (4, 3).
         focal: focal length and principal point of the fine image [pixels], (3,).
-        lights: room (8,) of `room_colour` and light map (nx, ny).
-        lengths: scene size and particle spacing [m], (2,).
+        lights: room (9,) of `room_colour` and light map (nx, ny).
+        lengths: scene size, particle spacing and least depth for the tint [m], (3,).
         supersample: fine pixels along a pixel's edge.
         picture: the last is written.
     """
@@ -49,9 +49,9 @@ def compose(solids, liquid, lines, view, focal, lights, lengths, supersample, pi
         for x in range(width):
             red, green, blue = 0.0, 0.0, 0.0
             empty = _only_room(x, y, supersample, solids, liquid, lines)
-            share = 1.0 / (supersample if empty else supersample * supersample)
-            for j in range(supersample):
-                for i in range(j if empty else 0, j + 1 if empty else supersample):
+            share = 1.0 if empty else 1.0 / (supersample * supersample)
+            for j in range(1 if empty else supersample):
+                for i in range(1 if empty else supersample):
                     r, g, b = _sample(
                         x * supersample + i,
                         y * supersample + j,
@@ -73,7 +73,7 @@ def compose(solids, liquid, lines, view, focal, lights, lengths, supersample, pi
 
 @device
 def _only_room(x, y, supersample, solids, liquid, lines):
-    """Is there nothing but the room in a pixel; its diagonal samples are enough then."""
+    """Is there nothing but the room in a pixel; one sample is enough then."""
     for j in range(y * supersample, (y + 1) * supersample):
         for i in range(x * supersample, (x + 1) * supersample):
             if solids[0][j, i] < np.inf or liquid[0][j, i, 0] < np.inf:
@@ -112,7 +112,7 @@ def _sample(x, y, solids, liquid, lines, view, focal, lights, lengths):
         if solid_depth[y, x] < np.inf:
             r, g, b = solid_picture[y, x, 0], solid_picture[y, x, 1], solid_picture[y, x, 2]
         else:
-            r, g, b = room_colour(view[0, 0], view[0, 1], view[0, 2], dx, dy, dz, room, light)
+            r, g, b = room_colour(view[0, 0], view[0, 1], view[0, 2], dx, dy, dz, room, light, 0.0)
         r, g, b = _mix_line(r, g, b, lines[0][y, x] * 0.55)
     return _mix_line(r, g, b, lines[1][y, x] * 0.8)
 
@@ -134,13 +134,13 @@ def _water(x, y, dx, dy, dz, stretch, solids, liquid, line, view, focal, lights,
     depth = max(thickness[y, x] * stretch, 0.2 * lengths[1])
     share = fresnel(-(dx * nx + dy * ny + dz * nz), WATER_INDEX)
     mx, my, mz = reflect(dx, dy, dz, nx, ny, nz)
-    mr, mg, mb = room_colour(px, py, pz, mx, my, mz, room, light)
+    mr, mg, mb = room_colour(px, py, pz, mx, my, mz, room, light, along)
     glint = 5.0 * lamp_glint(mx, my, mz, 350.0)
     tx, ty, tz = refract(dx, dy, dz, nx, ny, nz, WATER_INDEX)
     r, g, b = _behind(
-        px, py, pz, tx, ty, tz, depth, solids, liquid, line, view, focal, lights, lengths
+        px, py, pz, tx, ty, tz, along, depth, solids, liquid, line, view, focal, lights, lengths
     )
-    thick = depth / lengths[0]
+    thick = max(depth, lengths[2]) / lengths[0]
     r = BODY[0] + (r - BODY[0]) * np.exp(-ABSORPTION[0] * thick)
     g = BODY[1] + (g - BODY[1]) * np.exp(-ABSORPTION[1] * thick)
     b = BODY[2] + (b - BODY[2]) * np.exp(-ABSORPTION[2] * thick)
@@ -163,7 +163,7 @@ def _towards_eye(nx, ny, nz, dx, dy, dz):
 
 
 @device
-def _behind(px, py, pz, tx, ty, tz, depth, solids, liquid, line, view, focal, lights, lengths):
+def _behind(px, py, pz, tx, ty, tz, far, depth, solids, liquid, line, view, focal, lights, lengths):
     """Linear RGB seen through the water from entry point p in refracted direction t."""
     solid_depth, solid_picture = solids
     room, light = lights
@@ -184,14 +184,14 @@ def _behind(px, py, pz, tx, ty, tz, depth, solids, liquid, line, view, focal, li
     if i >= 0 and solid_depth[j, i] < np.inf and solid_depth[j, i] > liquid[0][j, i, 0]:
         return solid_picture[j, i, 0], solid_picture[j, i, 1], solid_picture[j, i, 2]
     if tz < 0.0 and pz + depth * tz < floor:  # on the floor: no air between
-        return room_colour(px, py, pz, tx, ty, tz, room, light)
+        return room_colour(px, py, pz, tx, ty, tz, room, light, far)
     qx, qy, qz = px + depth * tx, py + depth * ty, pz + depth * tz
     if i < 0:
-        return room_colour(qx, qy, qz, tx, ty, tz, room, light)
+        return room_colour(qx, qy, qz, tx, ty, tz, room, light, far)
     if back[j, i, 0] > 0.0:
         nx, ny, nz = _towards_eye(-back[j, i, 1], -back[j, i, 2], -back[j, i, 3], tx, ty, tz)
         tx, ty, tz = refract(tx, ty, tz, nx, ny, nz, 1.0 / WATER_INDEX)
-    r, g, b = room_colour(qx, qy, qz, tx, ty, tz, room, light)
+    r, g, b = room_colour(qx, qy, qz, tx, ty, tz, room, light, far)
     return _mix_line(r, g, b, line[j, i] * 0.5)
 
 
