@@ -6,6 +6,10 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "sph_ros"
+# Resolved, because colcon build --symlink-install runs a link to this file.
+ROOT = Path(__file__).resolve().parent
+    Path(__file__).resolve().parent
+)  # resolved: colcon --symlink-install runs a link to this file
 SHARED_FOLDERS = ("scenes", "launch", "rviz")
 
 # Jazzy's rclpy from PyPI, for machines without an apt-installed ROS. Never in install_requires: on
@@ -22,12 +26,11 @@ ROS_WHEELS = [
 
 def shared_files():
     """(target folder, [files]) of everything that goes to share/sph_ros, folders kept."""
-    root = Path(__file__).parent
     by_folder = {}
     for folder in SHARED_FOLDERS:
-        for path in sorted((root / folder).rglob("*")):
+        for path in sorted((ROOT / folder).rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts:
-                relative = path.relative_to(root)
+                relative = path.relative_to(ROOT)
                 by_folder.setdefault(f"share/{NAME}/{relative.parent}", []).append(str(relative))
     return sorted(by_folder.items())
 
@@ -36,7 +39,7 @@ setup(
     name=NAME,
     version="0.1.0",
     description="A real-time particle liquid for ROS 2, stirred and poured by pose messages.",
-    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     author="The sph_ros authors",
     maintainer="The sph_ros authors",
@@ -64,7 +67,6 @@ setup(
         "ros": ROS_WHEELS,
         "test": ["pytest", "ruff"],
     },
-    tests_require=["pytest"],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -81,7 +81,7 @@ def bag_path(name):
     if Path(name).exists():
         return Path(name)
     folder = share_folder() / "scenes" / "bags"
-    packaged = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    packaged = sorted(path.parent.name for path in folder.glob("*/metadata.yaml"))
     if str(name) not in packaged:
         raise SceneError(f"{name}: no such bag{nearest(str(name), packaged)}")
     return folder / str(name)
