@@ -8,8 +8,6 @@ from setuptools import find_packages, setup
 NAME = "sph_ros"
 # Resolved, because colcon build --symlink-install runs a link to this file.
 ROOT = Path(__file__).resolve().parent
-    Path(__file__).resolve().parent
-)  # resolved: colcon --symlink-install runs a link to this file
 SHARED_FOLDERS = ("scenes", "launch", "rviz")
 
 # Jazzy's rclpy from PyPI, for machines without an apt-installed ROS. Never in install_requires: on
@@ -57,7 +55,6 @@ setup(
         "opencv-python-headless",
         "pyyaml",
         "rosbags",
-        "mcap",
         "imageio-ffmpeg",
         "matplotlib",
         "viser",

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What colcon, pip and people read about the package says the same everywhere."""
 
+import ast
 import importlib
 import re
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
 
@@ -60,6 +62,29 @@ def test_every_message_package_that_nodes_import_is_a_dependency():
     for path in sources:
         for package in pattern.findall(path.read_text(encoding="utf-8")):
             assert package in declared, f"{path.name} imports {package}"
+
+
+# Import name -> name on PyPI, where they differ.
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "pyyaml"}
+# From a ROS installation or the extra `ros`; packages of messages are checked above.
+ROS_MODULES = {"rclpy", "tf2_ros", "ament_index_python", "rcl_interfaces", "builtin_interfaces"}
+
+
+def test_every_imported_distribution_is_required_and_none_is_idle():
+    required = re.search(r"install_requires=\[(.*?)\]", SETUP, re.DOTALL)[1]
+    required = set(re.findall(r'"([\w-]+)', required)) - {"setuptools"}
+    own = {"sph_ros", "msg_adapters"}
+    imported = set()
+    for path in [*(ROOT / "sph_ros").rglob("*.py"), *(ROOT / "msg_adapters").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add(node.module.split(".")[0])
+    imported -= own | ROS_MODULES | set(sys.stdlib_module_names)
+    imported = {name for name in imported if not name.endswith(("_msgs", "_srvs"))}
+    imported = {DISTRIBUTIONS.get(name, name.replace("_", "-")) for name in imported}
+    assert imported - {"llvmlite"} == required  # numba brings llvmlite
 
 
 def test_the_code_finds_the_files_that_belong_to_it():
