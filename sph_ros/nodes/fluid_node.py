@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -135,26 +136,39 @@ class FluidNode(Node):
 
     def _subscribe(self):
         transform = make_transform(self, self._runner.sim.scene.frame)
-        lockstep = self._step_mode == "lockstep"
-        # Best effort hears every publisher, reliable ones too.
-        qos = QoSProfile(
-            depth=LOCKSTEP_POSE_DEPTH if lockstep else POSE_DEPTH,
-            reliability=ReliabilityPolicy.BEST_EFFORT,
-        )
         gates = []
         for solid in self._runner.sim.scene.solids:
             if solid.control == "topic":
                 gate = PoseGate(solid.name, self._runner.sim.scene.frame, transform)
                 gates.append(gate)
-                self.create_subscription(
-                    PoseStamped,
-                    f"~/solids/{solid.name}/pose",
-                    lambda buffer, gate=gate: self._on_pose(gate, buffer),
-                    qos,
-                    raw=True,
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                )
+                # Reliable loses nothing, not even what is sent while both sides still discover each
+                # other; best effort hears every publisher, reliable ones too.
+                options = QoSOverridingOptions.with_default_policies()
+                self._hear(gate, self._step_mode == "lockstep", options)
         return gates
+
+    def _hear(self, gate, reliable, options):
+        """Subscribe to the poses of a solid; a reliable subscription gives way when it must."""
+        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        depth = LOCKSTEP_POSE_DEPTH if self._step_mode == "lockstep" else POSE_DEPTH
+
+        def give_way(_event):
+            self.destroy_subscription(subscription)
+            self._hear(gate, reliable=False, options=None)
+
+        events = SubscriptionEventCallbacks(use_default_callbacks=False)
+        if reliable:
+            # Not in the event's own callback: it belongs to what is destroyed.
+            events.incompatible_qos = lambda event: self.executor.create_task(give_way, event)
+        subscription = self.create_subscription(
+            PoseStamped,
+            f"~/solids/{gate.solid}/pose",
+            lambda buffer: self._on_pose(gate, buffer),
+            QoSProfile(depth=depth, reliability=policy),
+            event_callbacks=events,
+            qos_overriding_options=options,
+            raw=True,
+        )
 
     def _create_services(self):
         # A group of its own: services wait for the end of a step, poses must not wait with them.
