@@ -102,7 +102,8 @@ def test_file_and_dict_with_the_same_keys_make_the_same_scene(tmp_path):
     assert isinstance(from_file.solids[0].shape, Container)
 
 
-def test_everything_a_scene_can_say_arrives():
+def test_everything_a_scene_can_say_arrives(monkeypatch):
+    monkeypatch.setattr("sph_ros.sim.scene_types.EMITTERS_AVAILABLE", True)
     scene = load_scene(
         {
             "name": "all",
@@ -323,6 +324,7 @@ def test_refused_dicts():
     assert "expected a list" in message(changed("solids", {"name": "a"}))
     assert "keyframes" in message(changed("solids", 1, "control", "path"))
     assert "neither" in message(changed("emitters", [{"position": [0, 0, 0], "radius": 0.1}]))
+    assert "yet" in message(changed("emitters", [{"position": [0, 0, 0], "speed": 1}]))
     assert "<dict>: liquid[0]" in message(changed("liquid", 0, {"plane": {}}))
     assert "text" in message(changed("solids", 1, {"name": "m", "mesh": {"file": 3}}))
 

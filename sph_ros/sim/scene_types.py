@@ -18,6 +18,9 @@ Vector = tuple[float, float, float]
 SOLVERS = ("relaxation",)
 PLANNED_SOLVERS = ("forces", "incompressible")
 
+#: Emitters are read and checked; a scene with one is refused until a simulation runs them.
+EMITTERS_AVAILABLE = False
+
 #: Who moves a solid.
 CONTROLS = ("fixed", "topic", "path")
 PLANNED_CONTROLS = ("free",)
@@ -272,6 +275,8 @@ class Scene:
             raise ValueError(f"solver: {self.solver!r} is not available yet; {SOLVERS} are")
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
+        if self.emitters and not EMITTERS_AVAILABLE:
+            raise ValueError("emitters: no solver of this version emits particles yet")
         if isinstance(self.dimension, bool) or self.dimension not in (2, 3):
             raise ValueError(f"dimension: expected 2 or 3, got {self.dimension!r}")
         for key in ("name", "frame", "description"):
