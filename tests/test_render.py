@@ -49,6 +49,7 @@ def green(picture):
     return picture[..., 1].astype(int) - np.maximum(picture[..., 0], picture[..., 2])
 
 
+@pytest.mark.nojit
 def test_fresnel_limits():
     """2 % at normal incidence (n = 1.333), all at grazing, total beyond 48.6 degrees inside."""
     assert fresnel(1.0, WATER_INDEX) == pytest.approx((0.333 / 2.333) ** 2)
@@ -60,6 +61,7 @@ def test_fresnel_limits():
     assert fresnel(np.cos(critical - 0.05), 1.0 / WATER_INDEX) < 0.5
 
 
+@pytest.mark.nojit
 def test_snell_and_mirror():
     incoming = np.radians(40.0)
     bent = refract(np.sin(incoming), 0.0, -np.cos(incoming), 0.0, 0.0, 1.0, WATER_INDEX)
@@ -82,6 +84,7 @@ def test_ball_is_drawn_where_the_camera_projects_it():
     assert np.sqrt(mask.sum() / np.pi) == pytest.approx(radius, rel=0.03)
 
 
+@pytest.mark.nojit
 def test_up_is_up_and_right_is_right():
     camera = Camera.look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0))
     image, depth = camera.project([[0.3, 0.0, 0.2]], SIZE)

@@ -144,6 +144,7 @@ def test_single_particles_keep_a_drop_wherever_they_are():
     assert max(volumes) < 2.0 * min(volumes)  # a flying drop does not pulsate
 
 
+@pytest.mark.nojit
 def test_film_and_thread_do_not_vanish():
     film = extract_surface(lattice(15, 15, 1) + np.float32(0.0031), SPACING)
     thread = extract_surface(lattice(1, 1, 30) + np.float32(0.0031), SPACING)
@@ -153,6 +154,7 @@ def test_film_and_thread_do_not_vanish():
         assert 0.8 < enclosed_volume(mesh) / (count * SPACING**3) < 1.5
 
 
+@pytest.mark.nojit
 def test_separate_drops_are_separate_components():
     drops = [ball_of_particles(0.04, (x, 0.0, 0.0)) for x in (0.0, 0.13)]
     mesh = extract_surface(np.concatenate(drops), SPACING)
@@ -257,6 +259,7 @@ def test_known_walls_leave_distant_liquid_alone():
     assert component_count(extract_surface(near_wall, SPACING, walls=BOX_WALLS)) == 1
 
 
+@pytest.mark.nojit
 def test_no_particles_no_mesh():
     mesh = extract_surface(np.zeros((0, 3), np.float32), SPACING)
     assert [part.shape for part in mesh] == [(0, 3)] * 3

@@ -385,6 +385,12 @@ def _cubic_spline(distance):
     return 0.0
 
 
+@device
+def _reached_nodes(knot, cell):
+    """Nodes along an axis where a spline is not 0; one on its very end does not count."""
+    return int(np.ceil(4.0 * knot / cell - 1e-6))
+
+
 @kernel
 def _axis_weights(coordinate, cell, first, shift, knot, axis_weights):  # the last is written
     """Spline of one particle at the nodes along one axis; returns the first node and how many."""
@@ -410,7 +416,7 @@ def _splat(positions, shifts, cell, first, knot, flat, weights, field):  # the l
         weights: volume of each particle over knot^dimension [-], (N,).
         field: (nx, ny, nz).
     """
-    count = int(np.floor(4.0 * knot / cell[0])) + 1
+    count = _reached_nodes(knot, cell[0])
     wx = np.empty(count, np.float32)
     wy = np.ones(2, np.float32) if flat else np.empty(count, np.float32)
     wz = np.empty(count, np.float32)
@@ -438,7 +444,7 @@ def _lonely_weights(positions, shifts, cell, first, knot, flat, field, weights):
     the spline, unlike interpolation, hardly depends on where in its cell the particle is: a single
     drop does not pulsate while it flies.
     """
-    count = int(np.floor(4.0 * knot / cell[0])) + 1
+    count = _reached_nodes(knot, cell[0])
     wx = np.empty(count, np.float32)
     wy = np.ones(2, np.float32) if flat else np.empty(count, np.float32)
     wz = np.empty(count, np.float32)
