@@ -10,8 +10,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-pytestmark = pytest.mark.nojit
-
 # Package -> what its modules may not import, at any place in the file.
 FORBIDDEN = {
     "sph_ros/core": ("sph_ros.sim", "sph_ros.nodes", "sph_ros.render", "msg_adapters", "rclpy"),
