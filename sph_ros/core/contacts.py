@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.distances import distance_and_normal, signed_distance
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import device, inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.walls import wall_terms
 
@@ -54,7 +54,7 @@ class Contacts(NamedTuple):
     gradients: np.ndarray
 
 
-@device
+@inlined
 def to_solid(rotation, origin, s, x, y, z):
     """World point in the frame of solid s."""
     dx, dy, dz = x - origin[s, 0], y - origin[s, 1], z - origin[s, 2]
@@ -66,7 +66,7 @@ def to_solid(rotation, origin, s, x, y, z):
     )
 
 
-@device
+@inlined
 def rotate(rotation, s, x, y, z):
     """World direction of a direction in the frame of solid s."""
     r = rotation[s]
@@ -77,14 +77,14 @@ def rotate(rotation, s, x, y, z):
     )
 
 
-@device
+@inlined
 def to_world(rotation, origin, s, x, y, z):
     """World point of a point in the frame of solid s."""
     wx, wy, wz = rotate(rotation, s, x, y, z)
     return wx + origin[s, 0], wy + origin[s, 1], wz + origin[s, 2]
 
 
-@device
+@inlined
 def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
     """Write the contact of a point with solid s to `row` if it is near; whether it was."""
     lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
@@ -108,7 +108,7 @@ def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
     return True
 
 
-@device
+@inlined
 def combine_contacts(contacts, i, begin, end):
     """Product rule over the contacts of particle i: densities and gradients."""
     terms = contacts.terms
@@ -162,7 +162,7 @@ def find_contacts(positions, shapes, motion, inverse_step, chunks, contacts):
             combine_contacts(contacts, i, starts[i], cursor)
 
 
-@device
+@inlined
 def add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz):
     """Add a force at a world point to the wrench on solid s about its origin."""
     rx = x - motion.position[s, 0]
@@ -177,9 +177,7 @@ def add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz):
 
 
 @parallel_kernel
-def pressure_reactions(
-    positions, contacts, motion, sums, pressures, tension, scale, reactions
-):
+def pressure_reactions(positions, contacts, motion, sums, pressures, tension, scale, reactions):
     """Reaction of the solids' push by pressure and cohesion, the same terms that moved the particles.
 
     Args:
@@ -191,14 +189,13 @@ def pressure_reactions(
         reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.
     """
     count = positions.shape[0]
-    two = np.float32(2.0)
     for chunk in prange(reactions.shape[0]):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             if contacts.start[i] == contacts.end[i]:
                 continue
             pull = tension.cohesion * (sums.density[i] - np.float32(1.0)) - tension.near
-            push = two * (pressures[i] + tension.adhesion * pull) * scale
-            near_push = two * tension.near * tension.virial_ratio * sums.near_density[i] * scale
+            push = (pressures[i] + tension.adhesion * pull) * scale
+            near_push = tension.near * tension.virial_ratio * sums.near_density[i] * scale
             for k in range(contacts.start[i], contacts.end[i]):
                 t = contacts.terms[k]
                 add_reaction(
@@ -262,7 +259,7 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                 )
 
 
-@device
+@inlined
 def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest):
     """Share of the way from a to b, in the frame of solid s, at which a point meets the solid; 1: never.
 
@@ -283,7 +280,7 @@ def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, short
     return np.float32(1.0)
 
 
-@device
+@inlined
 def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
     """End of a motion from a to b that slides along solid s where it meets it, in the solid's frame."""
     dx, dy, dz = bx - ax, by - ay, bz - az
@@ -344,7 +341,19 @@ def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
 
 @parallel_kernel
 def keep_outside(
-    starts, ends, origins, shapes, motion, margin, spacing, planar, scale, reactions, squeezed
+    starts,
+    ends,
+    origins,
+    contacts,
+    near_only,
+    shapes,
+    motion,
+    margin,
+    spacing,
+    planar,
+    scale,
+    reactions,
+    squeezed,
 ):
     """Stop particles at solids: sweep each along its path relative to each moving solid.
 
@@ -355,6 +364,7 @@ def keep_outside(
     Args:
         starts: [m], (N, 3).
         ends: [m], (N, 3); changed where needed.
+        contacts, near_only: with the second, particles without a contact are taken to be too far away.
         origins: positions that the velocity will be reckoned from [m], (N, 3); moved along with particles that
             had to be rescued, so that a rescue is no kick.
         shapes, motion: the S solids.
@@ -371,7 +381,7 @@ def keep_outside(
     for chunk in prange(reactions.shape[0]):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             rounds = 0
-            moved = solids > 0
+            moved = not near_only or contacts.start[i] < contacts.end[i]
             while moved and rounds < 8:
                 moved = False
                 for s in range(solids):
@@ -413,9 +423,7 @@ def keep_outside(
             if is_free(shapes, motion, x, y, z, slack):
                 continue
             squeezed[chunk] += 1
-            found, px, py, pz = nearest_free_point(
-                shapes, motion, x, y, z, margin, spacing, planar
-            )
+            found, px, py, pz = nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar)
             if found:
                 ends[i, 0], ends[i, 1], ends[i, 2] = px, py, pz
                 origins[i, 0], origins[i, 1], origins[i, 2] = px, py, pz

@@ -16,13 +16,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-from sph_ros.core.jit import FASTMATH, parallel_kernel
-
-#: As `jit.device`, but always part of its caller's code: handing the many arrays of PackedShapes to
-#: a function that is really called counts references and takes 25 times as long as a far point.
-inlined = njit(fastmath=FASTMATH, cache=True, error_model="numpy", forceinline=True)
+from sph_ros.core.jit import inlined, parallel_kernel
 
 SPHERE, BOX, CAPSULE, CYLINDER, PLANE, GRID, UNION, INTERSECTION = range(8)
 

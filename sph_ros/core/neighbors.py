@@ -170,9 +170,7 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
             while begin < end:
                 if cursor + LANES > limit:
                     return np.intp(-1)
-                cursor = append_within(
-                    xs, ys, zs, begin, end, x, y, z, square, neighbors, cursor
-                )
+                cursor = append_within(xs, ys, zs, begin, end, x, y, z, square, neighbors, cursor)
                 begin += LANES
     return cursor
 

@@ -56,9 +56,7 @@ def predict_positions(positions, velocities, gravity, time_step, predicted):
 
 
 @parallel_kernel
-def cohesive_displacements(
-    pairs, sums, contact_gradients, tension, weight_ratio, displacements
-):
+def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio, displacements):
     """Displacement by near-pressure and by the cohesive part of the pressure: surface tension.
 
     Both pressures are scaled by dt^2 / (rho0 virial) [m^2]. In the bulk at rest they cancel: the rest density of
@@ -87,8 +85,8 @@ def cohesive_displacements(
             x += c * pairs.gradients[k, 0]
             y += c * pairs.gradients[k, 1]
             z += c * pairs.gradients[k, 2]
-        wall = np.float32(2.0) * tension.adhesion * own
-        wall_near = np.float32(2.0) * own_near
+        wall = tension.adhesion * own
+        wall_near = own_near
         g = contact_gradients
         displacements[i, 0] = -x - wall * g[i, 0] - wall_near * g[i, 3]
         displacements[i, 1] = -y - wall * g[i, 1] - wall_near * g[i, 4]
@@ -108,9 +106,8 @@ def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
     for i in prange(diagonal.shape[0]):
         own = sums.gradient_square[i] + compliance
         for axis in range(3):
-            total = sums.gradient[i, axis]
-            wall = contact_gradients[i, axis]
-            own += (total + wall) * (total + np.float32(2.0) * wall)
+            total = sums.gradient[i, axis] + contact_gradients[i, axis]
+            own += total * total
         diagonal[i] = max(own, compliance + np.float32(1e-12))
 
 
@@ -133,26 +130,40 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
             x += both * pairs.gradients[k, 0]
             y += both * pairs.gradients[k, 1]
             z += both * pairs.gradients[k, 2]
-        wall = np.float32(2.0) * own
-        displacements[i, 0] = cohesive[i, 0] - x - wall * contact_gradients[i, 0]
-        displacements[i, 1] = cohesive[i, 1] - y - wall * contact_gradients[i, 1]
-        displacements[i, 2] = cohesive[i, 2] - z - wall * contact_gradients[i, 2]
+        displacements[i, 0] = cohesive[i, 0] - x - own * contact_gradients[i, 0]
+        displacements[i, 1] = cohesive[i, 1] - y - own * contact_gradients[i, 1]
+        displacements[i, 2] = cohesive[i, 2] - z - own * contact_gradients[i, 2]
 
 
 @parallel_kernel
 def correct_pressures(
-    pairs, sums, contact_gradients, displacements, diagonal, compliance, relaxation, pressures, errors
+    pairs,
+    sums,
+    contact_gradients,
+    displacements,
+    diagonal,
+    compliance,
+    share,
+    momentum,
+    pressures,
+    guesses,
+    errors,
 ):
-    """One relaxed Jacobi iteration towards p = k (density - 1) >= 0 at the displaced positions.
+    """One iteration towards p = k (density - 1) >= 0 at the displaced positions.
+
+    A Jacobi correction, projected to pressures that push, then Nesterov's extrapolation (Beck & Teboulle
+    2009): both sides of the equation are the gradient of a convex function.
 
     Args:
         pairs, sums: from `sum_densities`.
         contact_gradients: as in `cohesive_displacements`.
-        displacements: by the present pressures [m], (N, 3).
+        displacements: by the present guesses [m], (N, 3).
         diagonal: from `pressure_diagonal`.
         compliance: as in `pressure_diagonal`.
-        relaxation: share of the Jacobi correction that is taken [-], float32.
+        share: of the Jacobi correction that is taken [-], float32.
+        momentum: share of the last change that is added on top for the next guess [-], float32.
         pressures: scaled [m^2], (N,); improved in place.
+        guesses: pressures extrapolated, (N,); those that `displacements` belong to, then the next.
         errors: sum over each chunk of the density error left [-], (chunks,) float64; written.
     """
     count = pressures.shape[0]
@@ -172,9 +183,11 @@ def correct_pressures(
                     + pairs.gradients[k, 1] * (y - displacements[j, 1])
                     + pairs.gradients[k, 2] * (z - displacements[j, 2])
                 )
-            pressure = pressures[i]
+            pressure = guesses[i]
             residual = sums.density[i] - np.float32(1.0) + change - compliance * pressure
-            pressures[i] = max(pressure + relaxation * residual / diagonal[i], np.float32(0.0))
+            better = max(pressure + share * residual / diagonal[i], np.float32(0.0))
+            guesses[i] = max(better + momentum * (better - pressures[i]), np.float32(0.0))
+            pressures[i] = better
             # Where there is no pressure a lack of density is a free surface, not an error.
             if residual > np.float32(0.0) or pressure > np.float32(0.0):
                 error += abs(residual)

@@ -97,9 +97,7 @@ def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cu
         near = builder.fcmp_ordered("<", total, _splat(builder, square_, _FLOATS))
         lanes = ir.Constant(_INTS, list(range(LANES)))
         room = builder.trunc(builder.sub(end_, begin_), ir.IntType(32))
-        mask = builder.and_(
-            near, builder.icmp_signed("<", lanes, _splat(builder, room, _INTS))
-        )
+        mask = builder.and_(near, builder.icmp_signed("<", lanes, _splat(builder, room, _INTS)))
         bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(32))
         first = builder.trunc(begin_, ir.IntType(32))
         target_pointer = _pointer(context, builder, sig.args[9], target_, cursor_)

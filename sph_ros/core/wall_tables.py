@@ -2,10 +2,22 @@
 """Wall weights tabulated over the distance to a solid (Harada, Koshizuka & Kawaguchi 2007).
 
 A solid stands for liquid at rest that is not simulated: its share of a particle's density is what
-lattice particles in its place would add, divided by the sum over the full lattice (`weights`). For
-a flat wall these are layers parallel to it at the depths (k + 1/2) spacing. For balls and cylinders
-the flat share is multiplied by the ratio of two continuous integrals of the weight, over the round
-solid and over the half space at the same distance.
+lattice particles in its place would add, divided by the sum over the full lattice (`weights`). There
+are two readings of a flat wall:
+
+* covered: lattice layers parallel to it at the depths (k + 1/2) spacing, wherever the particle is;
+* mirrored: the layers mirror the liquid's, so they lie 2 d + k spacing away from a particle at the
+  distance d.
+
+Half a spacing from the wall, where a liquid at rest has its first layer, both are the same. But the slope of
+the second is twice as large there, and that matters: pressure times slope is what pushes particles off. A push
+by the covered share is half of what a layer of liquid gives, so the first layer is pressed onto the wall;
+doubling the push instead (a wall particle with the pressure of the particle it touches) has no potential
+and keeps a tank boiling. So walls push by the mirrored share; the covered one says how far a solid reaches
+sideways, at edges.
+
+For balls and cylinders the flat share is multiplied by the ratio of two continuous integrals of the
+weight, over the round solid and over the half space at the same distance.
 
 Every table has the columns density and near-density and covers the distances -h ... h in equal
 steps; beyond h a wall adds nothing, deeper than -h its share is `full_cover`.
@@ -19,8 +31,8 @@ from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, lattice_sum
 
 POWERS = (DENSITY_POWER, NEAR_POWER)
 
-#: Steps of a table from -h to h; linear interpolation is then wrong by less than 2e-5.
-TABLE_STEPS = 512
+#: Steps of a table from -h to h; linear interpolation is then wrong by less than 1e-4.
+TABLE_STEPS = 1024
 
 # Both integrals of the ratio vanish towards h; from here on the last good ratio is kept.
 _LAST_GOOD_RATIO = 0.95
@@ -58,21 +70,31 @@ def layer_weight(power, height, support_radius, spacing, dimension):
     return 2.0 * support_radius / spacing * integral
 
 
-def flat_wall(distance, support_radius, spacing, dimension):
+def flat_wall(distance, support_radius, spacing, dimension, mirrored):
     """Share of the rest density that a flat wall adds at a signed distance [-], (..., 2).
 
-    Sum of lattice layers at the depths (k + 1/2) spacing. It never grows with the distance: where
-    the sum ripples deep inside the wall, its largest value farther out is kept.
+    It never grows with the distance: where the sum of layers ripples deep inside the wall, its
+    largest value farther out is kept. Both readings reach the same share deep inside.
+
+    Args:
+        distance: to the wall [m], negative inside, any shape.
+        support_radius: h [m].
+        spacing: s of the lattice [m].
+        dimension: 2 or 3.
+        mirrored: which of the two readings (see above).
     """
     distance = np.asarray(distance, dtype=float)
     fine = np.linspace(-support_radius, support_radius, 8 * TABLE_STEPS + 1)
-    layers = np.arange(int(math.ceil(2.0 * support_radius / spacing)) + 1)
-    height = fine[:, None] + (layers + 0.5) * spacing
+    layers = np.arange(int(math.ceil(4.0 * support_radius / spacing)) + 1)
+    covered = fine[:, None] + (layers + 0.5) * spacing
+    height = 2.0 * fine[:, None] + layers * spacing if mirrored else covered
     columns = []
     for power in POWERS:
         full = lattice_sum(power, support_radius, spacing, dimension)
         terms = layer_weight(power, height, support_radius, spacing, dimension)
         share = np.maximum.accumulate(terms.sum(axis=1)[::-1])[::-1] / full
+        deepest = layer_weight(power, covered[0], support_radius, spacing, dimension).sum() / full
+        share = np.minimum(share, deepest)
         columns.append(np.interp(distance, fine, share, right=0.0))
     return np.stack(columns, axis=-1)
 
@@ -151,38 +173,40 @@ class WallTables:
         self._index = {}
         self._tables = []
         self._distances = distances(support_radius)
-        self._flat = self.flat(self._distances)
-        self.full_cover = self._flat[0].copy()
-        self._add("flat", self._flat)
+        self._flat = {mirrored: self.flat(self._distances, mirrored) for mirrored in (True, False)}
+        self.full_cover = self._flat[False][0].copy()
+        self._add("mirrored", self._flat[True])
+        self._add("covered", self._flat[False])
 
-    def flat(self, distance):
+    def flat(self, distance, mirrored=True):
         """Share that a flat wall adds at the distances [m], (..., 2)."""
-        return flat_wall(distance, self.support_radius, self.spacing, self.dimension)
+        return flat_wall(distance, self.support_radius, self.spacing, self.dimension, mirrored)
 
     def ball(self, radius, inverted):
         """Index of the table of a ball (2D: a disc) of this radius [m]."""
         return self._round(radius, inverted, cylinder=False)
 
-    def cylinder(self, radius, inverted):
+    def cylinder(self, radius, inverted, mirrored=True):
         """Index of the table of an infinite cylinder; in 2D of the strip between its two sides."""
         if self.dimension == 3:
-            return self._round(radius, inverted, cylinder=True)
-        near = self._flat
+            return self._round(radius, inverted, cylinder=True, mirrored=mirrored)
+        near = self._flat[True]
         if inverted:
             far = self.flat(2.0 * radius - self._distances)
             share = 1.0 - (1.0 - near) * (1.0 - far)
         else:
-            share = near - self.flat(self._distances + 2.0 * radius)
+            # The mirrored distance counts twice: half the thickness.
+            share = near - self.flat(self._distances + radius)
         return self._add(("strip", radius, inverted), share)
 
-    def _round(self, radius, inverted, cylinder):
-        key = ("round", radius, inverted, cylinder)
+    def _round(self, radius, inverted, cylinder, mirrored=True):
+        key = ("round", radius, inverted, cylinder, mirrored)
         if key in self._index:
             return self._index[key]
         ratio = round_ratio(
             self._distances, radius, self.support_radius, self.dimension, cylinder, inverted
         )
-        return self._add(key, np.minimum(self._flat * ratio, self.full_cover))
+        return self._add(key, np.minimum(self._flat[mirrored] * ratio, self.full_cover))
 
     def _add(self, key, table):
         if key not in self._index:

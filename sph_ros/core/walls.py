@@ -5,13 +5,14 @@ Shares of the rest density come from tables over the distance (`wall_tables`). T
 wall is wrong at edges and corners, so leaves are put together as products, which is exact where the
 weight is a product over the axes and good for the real one:
 
-    solid box       F = c  prod over the axes of (F(d) - F(d + thickness)) / c
+    solid box       F = c  prod over the axes of the slab's share / c
     container box   F = 1 - prod over the six sides of (1 - F(d))
     cylinder        the same with a radial and an axial factor
     union           1 - (1 - a) (1 - b)
     intersection    a b / c
 
-with c = `full_cover`, the share deep inside a wall. Gradients are those of these very expressions,
+with c = `full_cover`, the share deep inside a wall. F is the mirrored share; only along the axes of a
+solid box or cylinder on which it does not face the particle is it the covered one. Gradients are those of these very expressions,
 of the tables' linear interpolants and of the grids' trilinear ones.
 """
 
@@ -29,7 +30,6 @@ from sph_ros.core.distances import (
     gradient_to_solid,
     grid_distance,
     grid_place,
-    inlined,
     leaf_distance,
     leaf_normal,
     length2,
@@ -38,12 +38,14 @@ from sph_ros.core.distances import (
     to_leaf,
     trilinear,
 )
-from sph_ros.core.jit import parallel_kernel
+from sph_ros.core.jit import inlined, parallel_kernel
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
-_FLAT = 0
+
+#: Rows of the flat wall's two readings in the tables.
+_MIRRORED, _COVERED = 0, 1
 
 
 @inlined
@@ -65,30 +67,39 @@ def wall_share(shapes, table, distance):
 
 
 @inlined
-def slab_factor(shapes, half, coordinate, inverted):
-    """One axis's factor of a box or cylinder with sides at -half and half, and its slope.
+def slab_factor(shapes, half, coordinate, facing):
+    """One axis's factor of a solid box or cylinder with sides at -half and half, and its slope.
 
-    The covered share of a solid's slab, or the free share between a container's two sides, 0 ... 1.
+    The covered share of the slab, 0 ... 1. On the axis that faces the particle the wall is mirrored: distances
+    count twice there, and so half the slab's thickness.
 
     Returns:
         (factor, slope, near factor, near slope), slopes [1/m].
     """
     u = abs(coordinate)
     side = sign_of(coordinate)
-    if inverted:
-        f0, df0, g0, dg0 = wall_share(shapes, _FLAT, half - u)
-        f1, df1, g1, dg1 = wall_share(shapes, _FLAT, half + u)
-        f0, f1, g0, g1 = _ONE - f0, _ONE - f1, _ONE - g0, _ONE - g1
-        return f0 * f1, side * (df0 * f1 - f0 * df1), g0 * g1, side * (dg0 * g1 - g0 * dg1)
+    table = _MIRRORED if facing else _COVERED
+    far = u if facing else u + half
     cf, cg = _ONE / shapes.full_cover[0], _ONE / shapes.full_cover[1]
-    f0, df0, g0, dg0 = wall_share(shapes, _FLAT, u - half)
-    f1, df1, g1, dg1 = wall_share(shapes, _FLAT, u + half)
+    f0, df0, g0, dg0 = wall_share(shapes, table, u - half)
+    f1, df1, g1, dg1 = wall_share(shapes, table, far)
     return (f0 - f1) * cf, side * (df0 - df1) * cf, (g0 - g1) * cg, side * (dg0 - dg1) * cg
 
 
 @inlined
+def gap_factor(shapes, half, coordinate):
+    """One axis's factor of a container: the free share between its sides, as `slab_factor`."""
+    u = abs(coordinate)
+    side = sign_of(coordinate)
+    f0, df0, g0, dg0 = wall_share(shapes, _MIRRORED, half - u)
+    f1, df1, g1, dg1 = wall_share(shapes, _MIRRORED, half + u)
+    f0, f1, g0, g1 = _ONE - f0, _ONE - f1, _ONE - g0, _ONE - g1
+    return f0 * f1, side * (df0 * f1 - f0 * df1), g0 * g1, side * (dg0 * g1 - g0 * dg1)
+
+
+@inlined
 def radial_factor(shapes, table, radius, r, inverted):
-    """The factor of a cylinder's round side, as `slab_factor`; the slope is along the radius."""
+    """The factor of a cylinder's round side, as `slab_factor` or `gap_factor`; slope along the radius."""
     if inverted:
         f, df, g, dg = wall_share(shapes, table, radius - r)
         return _ONE - f, df, _ONE - g, dg
@@ -109,10 +120,17 @@ def product_terms(cover, inverted, a, da, b, db, c, dc):
 @inlined
 def box_terms(shapes, node, x, y, z, inverted):
     """(f, fx, fy, fz, g, gx, gy, gz) of a box in its own frame."""
-    size = shapes.node_size
-    fx, dfx, gx, dgx = slab_factor(shapes, size[node, 0], x, inverted)
-    fy, dfy, gy, dgy = slab_factor(shapes, size[node, 1], y, inverted)
-    fz, dfz, gz, dgz = slab_factor(shapes, size[node, 2], z, inverted)
+    hx, hy, hz = shapes.node_size[node, 0], shapes.node_size[node, 1], shapes.node_size[node, 2]
+    if inverted:
+        fx, dfx, gx, dgx = gap_factor(shapes, hx, x)
+        fy, dfy, gy, dgy = gap_factor(shapes, hy, y)
+        fz, dfz, gz, dgz = gap_factor(shapes, hz, z)
+    else:
+        ax, ay, az = abs(x) - hx, abs(y) - hy, abs(z) - hz
+        nearest = max(ax, max(ay, az))
+        fx, dfx, gx, dgx = slab_factor(shapes, hx, x, ax == nearest)
+        fy, dfy, gy, dgy = slab_factor(shapes, hy, y, ay == nearest)
+        fz, dfz, gz, dgz = slab_factor(shapes, hz, z, az == nearest)
     f = product_terms(shapes.full_cover[0], inverted, fx, dfx, fy, dfy, fz, dfz)
     g = product_terms(shapes.full_cover[1], inverted, gx, dgx, gy, dgy, gz, dgz)
     return f[0], f[1], f[2], f[3], g[0], g[1], g[2], g[3]
@@ -124,9 +142,13 @@ def cylinder_terms(shapes, node, x, y, z, inverted):
     radius, half_length = shapes.node_size[node, 0], shapes.node_size[node, 1]
     r = length2(x, y)
     ux, uy = (x / r, y / r) if r > _ZERO else (_ZERO, _ZERO)
-    table = shapes.node_table[node, 0]
+    round_faces = inverted or r - radius >= abs(z) - half_length
+    table = shapes.node_table[node, 0 if round_faces else 1]
     fr, dfr, gr, dgr = radial_factor(shapes, table, radius, r, inverted)
-    fz, dfz, gz, dgz = slab_factor(shapes, half_length, z, inverted)
+    if inverted:
+        fz, dfz, gz, dgz = gap_factor(shapes, half_length, z)
+    else:
+        fz, dfz, gz, dgz = slab_factor(shapes, half_length, z, not round_faces)
     f = product_terms(shapes.full_cover[0], inverted, fr, dfr, fz, dfz, _ONE, _ZERO)
     g = product_terms(shapes.full_cover[1], inverted, gr, dgr, gz, dgz, _ONE, _ZERO)
     return f[0], f[1] * ux, f[1] * uy, f[2], g[0], g[1] * ux, g[1] * uy, g[2]
@@ -191,7 +213,7 @@ def grid_terms(shapes, node, x, y, z, inverted):
     grid = shapes.node_grid[node]
     sign = -_ONE if inverted else _ONE
     d, nx, ny, nz = grid_distance(shapes, grid, x, y, z)
-    f, df, g, dg = wall_share(shapes, _FLAT, d * sign)
+    f, df, g, dg = wall_share(shapes, _MIRRORED, d * sign)
     df, dg = df * sign, dg * sign
     i, u, ex = grid_place(shapes, grid, 0, x)
     j, v, ey = grid_place(shapes, grid, 1, y)
@@ -243,7 +265,7 @@ def leaf_terms(shapes, node, x, y, z):
     elif op == CYLINDER:
         t = cylinder_terms(shapes, node, px, py, pz, inverted)
     elif op == PLANE:
-        t = table_terms(shapes, node, px, py, pz, _FLAT, inverted)
+        t = table_terms(shapes, node, px, py, pz, _MIRRORED, inverted)
     else:
         t = table_terms(shapes, node, px, py, pz, shapes.node_table[node, 0], inverted)
     f, fx, fy, fz, g, gx, gy, gz = t

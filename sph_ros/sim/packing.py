@@ -284,7 +284,10 @@ class _Packer:
         if leaf.op == core.SPHERE:
             return self.tables.ball(radius, leaf.inverted), 0
         if leaf.op == core.CYLINDER:
-            return self.tables.cylinder(radius, leaf.inverted), 0
+            return (
+                self.tables.cylinder(radius, leaf.inverted),
+                self.tables.cylinder(radius, leaf.inverted, mirrored=False),
+            )
         if leaf.op == core.CAPSULE:
             side = self.tables.cylinder(radius, leaf.inverted)
             return side, self.tables.ball(radius, leaf.inverted)

@@ -13,12 +13,12 @@ from sph_ros.sim.scales import solver_scales
 from sph_ros.sim.state import Workspace, make_grid
 
 #: Pressure iterations end when the mean density error is below this share of the allowed compression ...
-TOLERANCE = 0.1
+TOLERANCE = 0.02
 #: ... and after at least and at most so many.
 LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
 
-#: Share of the Jacobi correction taken in each iteration (Ihmsen et al. 2014 use one half).
-JACOBI_SHARE = np.float32(0.5)
+#: Share of the Jacobi correction taken in each iteration. One half (Ihmsen et al. 2014) diverges for some packings.
+JACOBI_SHARE = np.float32(0.4)
 
 #: Distance that particles keep from solids, as a share of the spacing.
 MARGIN = 0.05
@@ -124,14 +124,18 @@ class RelaxationSolver:
         self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
         self._passed = now
 
-    def _keep_outside(self, starts, ends, origins, motion, time_step):
+    def _keep_outside(self, starts, ends, origins, near_only, motion, time_step):
         work = self._work
         scene = self._scene
+        if not len(self._solids):
+            return
         work.squeezed[:] = 0
         touch.keep_outside(
             starts,
             ends,
             origins,
+            work.contacts,
+            near_only,
             self._solids.packed,
             motion,
             np.float32(MARGIN * scene.spacing),
@@ -155,7 +159,7 @@ class RelaxationSolver:
         )
         work.starts[:] = fluid.positions
         motion = self._solids.motion
-        self._keep_outside(fluid.positions, work.predicted, work.starts, motion, time_step)
+        self._keep_outside(fluid.positions, work.predicted, work.starts, False, motion, time_step)
 
     def _grid(self):
         lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
@@ -190,9 +194,7 @@ class RelaxationSolver:
     def _find_neighbors(self):
         work = self._work
         search.transpose(work.predicted, work.columns)
-        while search.find_neighbors(
-            work.columns, self._grid_now, self._h, work.chunks, work.pairs
-        ):
+        while search.find_neighbors(work.columns, self._grid_now, self._h, work.chunks, work.pairs):
             work.enlarge_pairs()
 
     def _sum_densities(self):
@@ -231,30 +233,7 @@ class RelaxationSolver:
         compliance = np.float32(1.0 / (scales.stiffness * unit))
         relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
-        tolerance = TOLERANCE * self._material.compression * len(fluid)
-        for iteration in range(1, MOST_ITERATIONS + 1):
-            relax.pressure_displacements(
-                work.pairs, work.scaled, gradients, work.cohesive, work.displacements
-            )
-            relax.correct_pressures(
-                work.pairs,
-                work.sums,
-                gradients,
-                work.displacements,
-                work.diagonal,
-                compliance,
-                JACOBI_SHARE,
-                work.scaled,
-                work.errors,
-            )
-            error = float(work.errors.sum())
-            if iteration >= LEAST_ITERATIONS and error <= tolerance:
-                break
-        relax.pressure_displacements(
-            work.pairs, work.scaled, gradients, work.cohesive, work.displacements
-        )
-        self.iterations = iteration
-        self.density_error = error / max(len(fluid), 1)
+        self._solve_pressures(gradients, compliance)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         touch.pressure_reactions(
             work.predicted,
@@ -267,6 +246,41 @@ class RelaxationSolver:
             work.reactions,
         )
 
+    def _solve_pressures(self, gradients, compliance):
+        """Scaled pressures and their displacements, to the tolerance or the most iterations."""
+        work = self._work
+        work.guesses[:] = work.scaled
+        tolerance = TOLERANCE * self._material.compression * work.count
+        inertia, before = 1.0, np.inf
+        for iteration in range(1, MOST_ITERATIONS + 1):
+            relax.pressure_displacements(
+                work.pairs, work.guesses, gradients, work.cohesive, work.displacements
+            )
+            grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
+            relax.correct_pressures(
+                work.pairs,
+                work.sums,
+                gradients,
+                work.displacements,
+                work.diagonal,
+                compliance,
+                JACOBI_SHARE,
+                np.float32((inertia - 1.0) / grown),
+                work.scaled,
+                work.guesses,
+                work.errors,
+            )
+            error = float(work.errors.sum())
+            # Extrapolation that made it worse starts over (O'Donoghue & Candes 2015).
+            inertia, before = (1.0 if error > before else grown), error
+            if iteration >= LEAST_ITERATIONS and error <= tolerance:
+                break
+        relax.pressure_displacements(
+            work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+        )
+        self.iterations = iteration
+        self.density_error = error / max(work.count, 1)
+
     def _finish(self, fluid, time_step):
         """Relaxed positions outside all solids, and the velocities that follow from them."""
         work = self._work
@@ -277,8 +291,9 @@ class RelaxationSolver:
         still = self._solids.motion._replace(
             old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
         )
-        # From the predicted position, which is beside the solids as they are now.
-        self._keep_outside(work.predicted, ends, fluid.positions, still, time_step)
+        # From the predicted position, which is beside the solids as they are now. A displacement is not longer than
+        # the reach of a contact.
+        self._keep_outside(work.predicted, ends, fluid.positions, True, still, time_step)
         relax.velocities_from_positions(
             fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors
         )
@@ -288,9 +303,7 @@ class RelaxationSolver:
     def _apply_viscosity(self, fluid, time_step):
         """Viscosity and friction, which change velocities only."""
         work, scales = self._work, self.scales
-        slope = np.float32(
-            DENSITY_POWER * scales.density_scale / self._h
-        )
+        slope = np.float32(DENSITY_POWER * scales.density_scale / self._h)
         linear = scales.viscous_rate * time_step
         implicit = linear > EXPLICIT_VISCOSITY
         quadratic = scales.quadratic * time_step

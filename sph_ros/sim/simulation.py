@@ -79,9 +79,7 @@ class Simulation:
         count = self._substep_count()
         duration = self.time_step / count
         # Solids must not be faster than the liquid can follow.
-        fastest = min(
-            self.scene.max_solid_speed, SOLID_REACH * self.scene.spacing / duration
-        )
+        fastest = min(self.scene.max_solid_speed, SOLID_REACH * self.scene.spacing / duration)
         self._solver.timings = {}
         self._solver.squeezed = 0
         self._reactions[:] = 0.0
@@ -96,9 +94,7 @@ class Simulation:
     def _substep_count(self):
         """Substeps that keep solids and particles within their reach."""
         dt = self.time_step
-        ahead = min(
-            self._solids.distance_ahead(self.time, dt), self.scene.max_solid_speed * dt
-        )
+        ahead = min(self._solids.distance_ahead(self.time, dt), self.scene.max_solid_speed * dt)
         particle = self._solver.fastest * dt
         wanted = max(
             ahead / (SOLID_REACH * self.scene.spacing),

@@ -72,6 +72,7 @@ class Workspace:
         self.order = np.empty(count, np.int32)
         self.diagonal = np.empty(count, np.float32)
         self.scaled = np.empty(count, np.float32)
+        self.guesses = np.empty(count, np.float32)
         self.errors = np.zeros(self.chunks, np.float64)
         self.squeezed = np.zeros(self.chunks, np.int64)
         self.reactions = np.zeros((self.chunks, solids, 6), np.float64)
