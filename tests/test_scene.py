@@ -246,6 +246,11 @@ def test_overlapping_blocks_share_no_particle():
     assert len(positions) == 2000
 
 
+def test_no_liquid_is_fine_when_it_is_said():
+    positions, velocities = fill_liquid(load_scene({"spacing": 0.01, "liquid": []}))
+    assert positions.shape == velocities.shape == (0, 3)
+
+
 def test_two_dimensions_fill_the_plane():
     scene = load_scene({"spacing": 0.01, "dimension": 2, "liquid": [{"sphere": {"radius": 0.1}}]})
     positions, _ = fill_liquid(scene)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled functions on plain arrays: weights, neighbours, relaxation, distances, walls, surface."""
+"""Compiled functions on plain arrays: neighbours, relaxation, distances, walls, surface."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where particles feel solids: wall densities, the push back, friction, and the reaction on each solid.
+"""Where particles feel solids: wall densities, push, friction, and the reaction on each solid.
 
-A contact is one particle near one solid. All solids around a particle act together by the product rule of
-`walls`: the liquid's share of the support is the product of what each solid leaves free.
+A contact is one particle near one solid. All solids around a particle act together by the product
+rule of `walls`: the liquid's share of the support is the product of what each solid leaves free.
 """
 
 from typing import NamedTuple
@@ -40,8 +40,8 @@ class Contacts(NamedTuple):
     Attributes:
         start, end: (N,) int64.
         solid: (K,) int32.
-        terms: the columns named above, world frame; gradients already include the other solids' share and
-            are [1/m], the surface's velocity [m/s], (K, TERMS) float32.
+        terms: the columns named above, world frame; gradients already include the other solids'
+            share and are [1/m], the surface's velocity [m/s], (K, TERMS) float32.
         density: density and near-density that all solids add to particle i [-], (N, 2).
         gradients: sums of the gradients over the contacts [1/m], (N, 6).
     """
@@ -178,7 +178,7 @@ def add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz):
 
 @parallel_kernel
 def pressure_reactions(positions, contacts, motion, sums, pressures, tension, scale, reactions):
-    """Reaction of the solids' push by pressure and cohesion, the same terms that moved the particles.
+    """Reaction to the solids' push by pressure and cohesion: the terms that moved the particles.
 
     Args:
         positions: predicted [m], (N, 3).
@@ -261,9 +261,10 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
 
 @inlined
 def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest):
-    """Share of the way from a to b, in the frame of solid s, at which a point meets the solid; 1: never.
+    """Share of the way from a to b, in the frame of solid s, at which a point meets it; 1: never.
 
-    Sphere tracing: the distance is how far one can go in any direction. A start inside counts as no hit.
+    Sphere tracing: the distance is how far one can go in any direction. A start inside counts as no
+    hit.
     """
     dx, dy, dz = bx - ax, by - ay, bz - az
     if distance <= margin:
@@ -282,7 +283,7 @@ def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, short
 
 @inlined
 def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
-    """End of a motion from a to b that slides along solid s where it meets it, in the solid's frame."""
+    """End of a motion from a to b that slides along solid s where it meets it, solid's frame."""
     dx, dy, dz = bx - ax, by - ay, bz - az
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     distance = signed_distance(shapes, s, ax, ay, az)
@@ -357,16 +358,18 @@ def keep_outside(
 ):
     """Stop particles at solids: sweep each along its path relative to each moving solid.
 
-    A particle starts at `starts` beside the solids at their old poses and wants to be at `ends` when they are at their
-    new ones. In a solid's own frame it moves on a straight line; where that meets the solid the rest
-    of the motion slides along it. So neither a fast particle nor a fast or thin solid passes through.
+    A particle starts at `starts` beside the solids at their old poses and wants to be at `ends`
+    when they are at their new ones. In a solid's own frame it moves on a straight line; where that
+    meets the solid the rest of the motion slides along it. So neither a fast particle nor a fast or
+    thin solid passes through.
 
     Args:
         starts: [m], (N, 3).
         ends: [m], (N, 3); changed where needed.
-        contacts, near_only: with the second, particles without a contact are taken to be too far away.
-        origins: positions that the velocity will be reckoned from [m], (N, 3); moved along with particles that
-            had to be rescued, so that a rescue is no kick.
+        contacts, near_only: with the second, particles without a contact are taken to be too far
+            away.
+        origins: positions that the velocity will be reckoned from [m], (N, 3); moved along with
+            particles that had to be rescued, so that a rescue is no kick.
         shapes, motion: the S solids.
         margin: distance to keep [m], float32.
         spacing: of the particles [m], float32.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cell-sorted particles and their neighbour lists.
 
-Particles are sorted by cell (cells of one support radius, x fastest), so the candidates of a particle are nine
-contiguous runs (three in 2D). A list and the geometry of each pair are made once a step and read by every
-pass of the solver. A particle is its own neighbour: its gradient with itself is zero and its weight is the
-self term of the density, so no pass has to make an exception.
+Particles are sorted by cell (cells of one support radius, x fastest), so the candidates of a
+particle are nine contiguous runs (three in 2D). A list and the geometry of each pair are made once
+a step and read by every pass of the solver. A particle is its own neighbour: its gradient with
+itself is zero and its weight is the self term of the density, so no pass has to make an exception.
 """
 
 from typing import NamedTuple
@@ -108,7 +108,8 @@ def sort_by_cell(positions, grid, cell_of, order):
         positions: [m], (N, 3).
         grid: its `cell_start` is written.
         cell_of: cell of each particle, (N,) int32; written.
-        order: order[k] is the present row of the particle that is to become row k, (N,) int32; written.
+        order: order[k] is the present row of the particle that is to become row k, (N,) int32;
+            written.
     """
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
     cell_start = grid.cell_start
@@ -179,8 +180,8 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
 def find_neighbors(columns, grid, support_radius, chunks, pairs):
     """Neighbour lists of all particles.
 
-    Chunk k of `CHUNK` particles appends to its own part of the list, neighbors[k * room:(k + 1) * room] with
-    room = len(neighbors) // chunks, so nothing has to be counted first.
+    Chunk k of `CHUNK` particles appends to its own part of the list, neighbors[k * room:(k + 1) *
+    room] with room = len(neighbors) // chunks, so nothing has to be counted first.
 
     Args:
         columns: cell-sorted coordinates [m], (3, N + padding) with N = len(pairs.start).

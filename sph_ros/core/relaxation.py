@@ -2,15 +2,16 @@
 """Double density relaxation, solved for the pressure instead of taken in one explicit pass.
 
 Clavet, Beaudoin & Poulin 2005 move each pair of neighbours at their predicted positions by
-dt^2 [P (1 - q) + P_near (1 - q)^2] with P = k (rho - rho0), P_near = k_near rho_near. One such pass is explicit in the
-stiffness k. Here the same displacements are taken with the pressures that the particles have *after*
-the move, P = k (rho(x + u) - rho0) >= 0, found by relaxed Jacobi iteration on the density linearised
-about the predicted positions (the scheme of Ihmsen et al. 2014, with the compliance 1/k kept). So k may be
-that of a nearly incompressible liquid at any time step. The near-pressure and the
-cohesive part of the pressure, which make surface tension, are soft and stay explicit as in the paper.
+dt^2 [P (1 - q) + P_near (1 - q)^2] with P = k (rho - rho0), P_near = k_near rho_near. One such pass
+is explicit in the stiffness k. Here the same displacements are taken with the pressures that the
+particles have *after* the move, P = k (rho(x + u) - rho0) >= 0, found by relaxed Jacobi iteration
+on the density linearised about the predicted positions (the scheme of Ihmsen et al. 2014, with the
+compliance 1/k kept). So k may be that of a nearly incompressible liquid at any time step. The
+near-pressure and the cohesive part of the pressure, which make surface tension, are soft and stay
+explicit as in the paper.
 
-Each particle gathers from its neighbours. The two sides of a pair are the same numbers with opposite signs, so
-momentum is conserved to rounding.
+Each particle gathers from its neighbours. The two sides of a pair are the same numbers with
+opposite signs, so momentum is conserved to rounding.
 """
 
 from typing import NamedTuple
@@ -59,16 +60,17 @@ def predict_positions(positions, velocities, gravity, time_step, predicted):
 def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio, displacements):
     """Displacement by near-pressure and by the cohesive part of the pressure: surface tension.
 
-    Both pressures are scaled by dt^2 / (rho0 virial) [m^2]. In the bulk at rest they cancel: the rest density of
-    the cohesive part lies above 1 by near / cohesion. The work they do belongs to a potential (a sum of squares of
-    both densities), so they cannot feed energy into a drop.
+    Both pressures are scaled by dt^2 / (rho0 virial) [m^2]. In the bulk at rest they cancel: the
+    rest density of the cohesive part lies above 1 by near / cohesion. The work they do belongs to a
+    potential (a sum of squares of both densities), so they cannot feed energy into a drop.
 
     Args:
         pairs, sums: from `sum_densities`.
-        contact_gradients: gradients of the density and the near-density that walls add [1/m], (N, 6).
+        contact_gradients: gradients of the density and the near-density that walls add [1/m], (N,
+            6).
         tension: scaled stiffnesses, `Tension`.
-        weight_ratio: 3/2 density lattice sum / near lattice sum: near gradient per density gradient and
-            (1 - r/h) [-], float32.
+        weight_ratio: 3/2 density lattice sum / near lattice sum: near gradient per density gradient
+            and (1 - r/h) [-], float32.
         displacements: [m], (N, 3); written.
     """
     cohesion, near = tension.cohesion, tension.near * tension.virial_ratio
@@ -151,8 +153,8 @@ def correct_pressures(
 ):
     """One iteration towards p = k (density - 1) >= 0 at the displaced positions.
 
-    A Jacobi correction, projected to pressures that push, then Nesterov's extrapolation (Beck & Teboulle
-    2009): both sides of the equation are the gradient of a convex function.
+    A Jacobi correction, projected to pressures that push, then Nesterov's extrapolation (Beck &
+    Teboulle 2009): both sides of the equation are the gradient of a convex function.
 
     Args:
         pairs, sums: from `sum_densities`.
@@ -198,8 +200,9 @@ def correct_pressures(
 def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
     """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
 
-    The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also press. The
-    quadratic one acts on approaching pairs. No pair gives more than half its relative speed.
+    The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also
+    press. The quadratic one acts on approaching pairs. No pair gives more than half its relative
+    speed.
 
     Args:
         pairs: from `sum_densities`.
@@ -241,8 +244,8 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
 def viscous_operator(pairs, velocities, slope, linear, result):
     """Left side of implicit viscosity: v minus the linear impulses that v itself would cause.
 
-    Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum is kept
-    by every iteration.
+    Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum
+    is kept by every iteration.
 
     Args:
         pairs, velocities, slope, linear: as in `viscous_impulses`.
@@ -283,7 +286,7 @@ def chunk_dots(a, b, sums):
 
 @parallel_kernel
 def finish_positions(predicted, displacements, longest, ends):
-    """Relaxed positions: predicted plus displacement, which no correction may make longer than `longest`.
+    """Relaxed positions: predicted plus displacement, no longer than `longest`.
 
     Args:
         predicted, displacements: [m], (N, 3).

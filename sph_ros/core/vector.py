@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one vector instruction that LLVM does not find by itself: append the indices of near points.
 
-The search for neighbours compares some 200 candidates for 30 hits. As a scalar loop that costs more than
-everything else in a step. Sixteen candidates are compared at once here, and the hits are stored
-one after the other: by one compressing store where the processor has it (AVX-512), else by walking the set bits
-of the comparison's mask. Both give the same list in the same order.
+The search for neighbours compares some 200 candidates for 30 hits. As a scalar loop that costs more
+than everything else in a step. Sixteen candidates are compared at once here, and the hits are
+stored one after the other: by one compressing store where the processor has it (AVX-512), else by
+walking the set bits of the comparison's mask. Both give the same list in the same order.
 """
 
 import llvmlite.binding as llvm

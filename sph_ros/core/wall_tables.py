@@ -2,19 +2,19 @@
 """Wall weights tabulated over the distance to a solid (Harada, Koshizuka & Kawaguchi 2007).
 
 A solid stands for liquid at rest that is not simulated: its share of a particle's density is what
-lattice particles in its place would add, divided by the sum over the full lattice (`weights`). There
-are two readings of a flat wall:
+lattice particles in its place would add, divided by the sum over the full lattice (`weights`).
+There are two readings of a flat wall:
 
 * covered: lattice layers parallel to it at the depths (k + 1/2) spacing, wherever the particle is;
 * mirrored: the layers mirror the liquid's, so they lie 2 d + k spacing away from a particle at the
   distance d.
 
-Half a spacing from the wall, where a liquid at rest has its first layer, both are the same. But the slope of
-the second is twice as large there, and that matters: pressure times slope is what pushes particles off. A push
-by the covered share is half of what a layer of liquid gives, so the first layer is pressed onto the wall;
-doubling the push instead (a wall particle with the pressure of the particle it touches) has no potential
-and keeps a tank boiling. So walls push by the mirrored share; the covered one says how far a solid reaches
-sideways, at edges.
+Half a spacing from the wall, where a liquid at rest has its first layer, both are the same. But the
+slope of the second is twice as large there, and that matters: pressure times slope is what pushes
+particles off. A push by the covered share is half of what a layer of liquid gives, so the first
+layer is pressed onto the wall; doubling the push instead (a wall particle with the pressure of the
+particle it touches) has no potential and keeps a tank boiling. So walls push by the mirrored share;
+the covered one says how far a solid reaches sideways, at edges.
 
 For balls and cylinders the flat share is multiplied by the ratio of two continuous integrals of the
 weight, over the round solid and over the half space at the same distance.

@@ -11,9 +11,10 @@ weight is a product over the axes and good for the real one:
     union           1 - (1 - a) (1 - b)
     intersection    a b / c
 
-with c = `full_cover`, the share deep inside a wall. F is the mirrored share; only along the axes of a
-solid box or cylinder on which it does not face the particle is it the covered one. Gradients are those of these very expressions,
-of the tables' linear interpolants and of the grids' trilinear ones.
+with c = `full_cover`, the share deep inside a wall. F is the mirrored share; only along the axes of
+a solid box or cylinder on which it does not face the particle is it the covered one. Gradients are
+those of these very expressions, of the tables' linear interpolants and of the grids' trilinear
+ones.
 """
 
 import numpy as np
@@ -70,8 +71,8 @@ def wall_share(shapes, table, distance):
 def slab_factor(shapes, half, coordinate, facing):
     """One axis's factor of a solid box or cylinder with sides at -half and half, and its slope.
 
-    The covered share of the slab, 0 ... 1. On the axis that faces the particle the wall is mirrored: distances
-    count twice there, and so half the slab's thickness.
+    The covered share of the slab, 0 ... 1. On the axis that faces the particle the wall is
+    mirrored: distances count twice there, and so half the slab's thickness.
 
     Returns:
         (factor, slope, near factor, near slope), slopes [1/m].
@@ -99,7 +100,7 @@ def gap_factor(shapes, half, coordinate):
 
 @inlined
 def radial_factor(shapes, table, radius, r, inverted):
-    """The factor of a cylinder's round side, as `slab_factor` or `gap_factor`; slope along the radius."""
+    """The factor of a cylinder's round side, as `slab_factor` or `gap_factor`."""
     if inverted:
         f, df, g, dg = wall_share(shapes, table, radius - r)
         return _ONE - f, df, _ONE - g, dg

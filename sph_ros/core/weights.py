@@ -2,8 +2,9 @@
 """The weights of double density relaxation and their sums over the rest lattice.
 
 Clavet, Beaudoin & Poulin 2005 weigh a neighbour at distance r by (1 - r/h)^2 for the density and by
-(1 - r/h)^3 for the near-density. Their sums have no unit. Here both are divided by their sum over the liquid
-at rest, a square lattice of the particle spacing, self included: a density of 1 is the rest density.
+(1 - r/h)^3 for the near-density. Their sums have no unit. Here both are divided by their sum over
+the liquid at rest, a square lattice of the particle spacing, self included: a density of 1 is the
+rest density.
 """
 
 import itertools
@@ -14,7 +15,7 @@ NEAR_POWER = 3
 
 
 def _lattice_distances(support_radius, spacing, dimension):
-    """Distances [m] from a lattice point to all lattice points within the support, itself included."""
+    """Distances [m] from a lattice point to all within the support, itself included."""
     reach = int(math.ceil(support_radius / spacing))
     for offset in itertools.product(range(-reach, reach + 1), repeat=dimension):
         distance = spacing * math.sqrt(sum(c * c for c in offset))
@@ -40,8 +41,8 @@ def lattice_sum(power, support_radius, spacing, dimension):
 def gradient_sum(power, support_radius, spacing, dimension):
     """How much pressure the lattice transmits per unit of nominal pressure [-].
 
-    The virial of the normalised weight, (1/d) sum of r |dw/dr|; 1 for an ideal quadrature. Dividing pressure
-    accelerations by it makes the pressure of a liquid at rest the physical one.
+    The virial of the normalised weight, (1/d) sum of r |dw/dr|; 1 for an ideal quadrature. Dividing
+    pressure accelerations by it makes the pressure of a liquid at rest the physical one.
     """
     virial = math.fsum(
         r * power * (1.0 - r / support_radius) ** (power - 1) / support_radius

@@ -26,8 +26,8 @@ class Material:
         density: rest density [kg/m^3].
         viscosity: dynamic viscosity [Pa s].
         surface_tension: against air [N/m].
-        compression: relative compression allowed at the deepest point of the liquid at rest [-]; the
-            stiffness follows from it.
+        compression: relative compression allowed at the deepest point of the liquid at rest [-];
+            the stiffness follows from it.
         wall_friction: 0 lets the liquid slip along solids, 1 drags it with them [-].
         adhesion: how strongly solids hold the liquid, as a share of its own cohesion [-].
         quadratic_viscosity: Clavet's beta times the spacing: damps pairs that collide fast [-].

@@ -12,12 +12,14 @@ from sph_ros.core.weights import DENSITY_POWER
 from sph_ros.sim.scales import solver_scales
 from sph_ros.sim.state import Workspace, make_grid
 
-#: Pressure iterations end when the mean density error is below this share of the allowed compression ...
+#: Pressure iterations end when the mean density error is below this share of the allowed
+#: compression ...
 TOLERANCE = 0.02
 #: ... and after at least and at most so many.
 LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
 
-#: Share of the Jacobi correction taken in each iteration. One half (Ihmsen et al. 2014) diverges for some packings.
+#: Share of the Jacobi correction taken in each iteration. One half (Ihmsen et al. 2014) diverges
+#: for some packings.
 JACOBI_SHARE = np.float32(0.4)
 
 #: Distance that particles keep from solids, as a share of the spacing.
@@ -95,7 +97,7 @@ class RelaxationSolver:
         return self._work.reactions.sum(axis=0)
 
     def densities(self, fluid):
-        """Densities at the present positions relative to rest [-], (N,) float32, rows as in `fluid`."""
+        """Densities at the present positions relative to rest [-], (N,), rows as in `fluid`."""
         self._prepare(fluid)
         work = self._work
         work.predicted[:] = fluid.positions
@@ -291,8 +293,8 @@ class RelaxationSolver:
         still = self._solids.motion._replace(
             old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
         )
-        # From the predicted position, which is beside the solids as they are now. A displacement is not longer than
-        # the reach of a contact.
+        # From the predicted position, which is beside the solids as they are now. A displacement is
+        # not longer than the reach of a contact.
         self._keep_outside(work.predicted, ends, fluid.positions, True, still, time_step)
         relax.velocities_from_positions(
             fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors

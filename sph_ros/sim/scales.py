@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """From SI materials to the numbers of the solver, and the time step that suits a scene.
 
-The weights are normalised by their lattice sums (see `core.weights`), so a particle's density is 1 at rest and
-its pressure is in pascal. With w the normalised weight, m = rho0 s^d the mass and G the virial of w, the
-acceleration is a_i = -1 / (rho0 G) sum_j (p_i + p_j) grad w_ij, which for Clavet's pair displacement
-dt^2 / 2 (P_i + P_j)(1 - q) means P = 4 p / (rho0 G h sum of weights): his stiffness in SI.
+The weights are normalised by their lattice sums (see `core.weights`), so a particle's density is 1
+at rest and its pressure is in pascal. With w the normalised weight, m = rho0 s^d the mass and G the
+virial of w, the acceleration is a_i = -1 / (rho0 G) sum_j (p_i + p_j) grad w_ij, which for Clavet's
+pair displacement dt^2 / 2 (P_i + P_j)(1 - q) means P = 4 p / (rho0 G h sum of weights): his
+stiffness in SI.
 
-* Stiffness: p = K (density - 1). The deepest point of the liquid at rest bears rho0 g H and may yield by the
-  material's `compression`, so K = rho0 g H / compression. Where there is no gravity a speed stands for
-  sqrt(g H).
+* Stiffness: p = K (density - 1). The deepest point of the liquid at rest bears rho0 g H and may
+yield by the
+  material's `compression`, so K = rho0 g H / compression. Where there is no gravity a speed stands
+  for sqrt(g H).
 * Viscosity: pair forces -gamma (1 - q) along the line of centres make the shear viscosity
-  mu = gamma n^2 / (2 d (d + 2)) integral of (1 - q) r^2 (Irving-Kirkwood; for d = 3 the well known 2 pi / 15 of
-  dissipative particle dynamics). The integral is a lattice sum here.
+  mu = gamma n^2 / (2 d (d + 2)) integral of (1 - q) r^2 (Irving-Kirkwood; for d = 3 the well known
+  2 pi / 15 of dissipative particle dynamics). The integral is a lattice sum here.
 * Surface tension: the potential of the cohesive pressures is
-  E = s^d sum_i [Kc / (2 G) (density - 1 - b)^2 + Kc b / (2 Gn) near_density^2] with b = Kn / Kc; the excess of
-  the outermost lattice layers per area is the surface tension, linear in Kc.
+  E = s^d sum_i [Kc / (2 G) (density - 1 - b)^2 + Kc b / (2 Gn) near_density^2] with b = Kn / Kc;
+  the excess of the outermost lattice layers per area is the surface tension, linear in Kc.
 """
 
 import itertools
@@ -154,7 +156,7 @@ def stable_time_step(scene, scales, drop):
 
 
 def _round_down(step):
-    """The largest of 1, 1.25, 1.6, 2, 2.5, 3.2, 4, 5, 6.4, 8 times a power of ten, not above `step`."""
+    """The largest readable number not above `step`: 1, 1.25, ... 8 times a power of ten."""
     exponent = math.floor(math.log10(step))
     for mantissa in (8, 6.4, 5, 4, 3.2, 2.5, 2, 1.6, 1.25, 1):
         value = mantissa * 10.0**exponent

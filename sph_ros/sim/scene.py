@@ -130,6 +130,8 @@ def load_scene(source):
 
 
 def _read_scene(root: Node, folder: Path, name: str) -> Scene:
+    if not {"liquid", "emitters"} & set(root.mapping()):
+        raise root.error("expected liquid or emitters, got neither; `liquid: []` if none is meant")
     extra = {"source": root.where.rsplit(":", 1)[0]}
     if "name" not in root.mapping():
         extra["name"] = name

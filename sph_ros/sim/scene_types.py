@@ -266,8 +266,6 @@ class Scene:
                 f"support_radius: expected {low:g} to {high:g} m (1.2 to 4 spacings), "
                 f"got {self.support_radius:g}"
             )
-        if not self.liquid and not self.emitters:
-            raise ValueError("liquid: expected liquid or emitters, got neither")
         self._check_names()
 
     def _check_words(self):

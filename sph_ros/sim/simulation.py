@@ -160,8 +160,8 @@ class Simulation:
         """The liquid's surface as triangles.
 
         Returns:
-            vertices (V, 3) float32 [m], triangles (T, 3) int32, counter-clockwise seen from outside; both
-            empty where there is no liquid.
+            vertices (V, 3) float32 [m], triangles (T, 3) int32, counter-clockwise seen from
+            outside; both empty where there is no liquid.
         """
         vertices, triangles, _ = extract_surface(
             self.positions,
@@ -179,7 +179,7 @@ class Simulation:
         return self._solids.names
 
     def solid(self, name):
-        """The solid called `name`: position, quat_xyzw, velocity, angular_velocity, signed_distance().
+        """The solid called `name`: its pose, velocities and signed_distance().
 
         Raises:
             KeyError: there is none.
@@ -190,8 +190,8 @@ class Simulation:
         """Let a solid sweep to a pose.
 
         It moves steadily and arrives at `time`, but no point of it is faster than the scene's
-        `max_solid_speed`, so it may arrive later. Orders for later times queue up; one that is not later than
-        those that wait replaces them.
+        `max_solid_speed`, so it may arrive later. Orders for later times queue up; one that is not
+        later than those that wait replaces them.
 
         Args:
             name: of a solid whose control is not `fixed`.
@@ -217,11 +217,12 @@ class Simulation:
     def wrench(self, name):
         """Force and torque of the liquid on a solid, averaged over the last step.
 
-        Momentum that the solid gave to the liquid in the step, per second and with the opposite sign.
+        Momentum that the solid gave to the liquid in the step, per second and with the opposite
+        sign.
 
         Returns:
-            force (3,) [N] and torque (3,) about the solid's origin [N m], world frame, float64. In 2D per
-            metre of depth.
+            force (3,) [N] and torque (3,) about the solid's origin [N m], world frame, float64. In
+            2D per metre of depth.
 
         Raises:
             KeyError: there is no such solid.
@@ -236,11 +237,12 @@ class Simulation:
         """Facts of the present state.
 
         Returns:
-            dict with time [s], particle_count, mean_compression and max_compression (density above rest over
-            rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s], lost_particles (those
-            outside all closed containers or no longer finite), squeezed_particles (rescued from between solids
-            in the last step), substeps and iterations of the last step, density_error (mean, left by the last
-            iteration, -). In 2D energies and momenta are per metre of depth.
+            dict with time [s], particle_count, mean_compression and max_compression (density above
+            rest over rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s],
+            lost_particles (those outside all closed containers or no longer finite),
+            squeezed_particles (rescued from between solids in the last step), substeps and
+            iterations of the last step, density_error (mean, left by the last iteration, -). In 2D
+            energies and momenta are per metre of depth.
         """
         velocities = self._fluid.velocities.astype(np.float64)
         mass = self._solver.scales.mass

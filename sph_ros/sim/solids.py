@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solids of a simulation: where they are, where they are told to go, and how they get there.
 
-A solid never teleports. Told a pose it moves there in a straight line with a steady turn, no faster than the scene's
-`max_solid_speed`, and the liquid feels every substep of the way. So a marker that jumps, flips or is lost for a
-while makes a quick push but no splash.
+A solid never teleports. Told a pose it moves there in a straight line with a steady turn, no faster
+than the scene's `max_solid_speed`, and the liquid feels every substep of the way. So a marker that
+jumps, flips or is lost for a while makes a quick push but no splash.
 """
 
 import math
@@ -52,7 +52,7 @@ class Solid:
     """
 
     def __init__(self, spec, packed, index, reach):
-        """Args: the scene's SolidSpec, the packed shapes, its index there, its largest radius [m]."""
+        """Args: the scene's SolidSpec, packed shapes, index among them, largest radius [m]."""
         self.name = spec.name
         self.control = spec.control
         self.shape = spec.shape
@@ -76,7 +76,7 @@ class Solid:
         )
 
     def mesh(self):
-        """Triangles to draw: vertices (V, 3) float32 [m] in the solid's frame, triangles (T, 3) int32."""
+        """Triangles to draw, solid's frame: vertices (V, 3) float32 [m], triangles (T, 3) int32."""
         return display_mesh(self.shape)
 
     def signed_distance(self, points):
@@ -111,7 +111,7 @@ class Solid:
         )
 
     def advance(self, now, duration, max_speed):
-        """Move on for `duration` [s] from time `now`, no point of it faster than `max_speed` [m/s]."""
+        """Move on for `duration` [s] from `now`, no point of it faster than `max_speed` [m/s]."""
         position, quat = self._wanted(now, now + duration)
         shift = position - self.position
         turn = quaternions.between(self.quat_xyzw, quat)

@@ -111,8 +111,8 @@ class Workspace:
 def make_grid(lower, upper, cell, count):
     """Grid of cells over the box from `lower` to `upper` [m] for `count` particles.
 
-    A stray particle must not make it huge: the outermost cells also hold what lies beyond, so the longest
-    axes are cut until the number of cells is in proportion.
+    A stray particle must not make it huge: the outermost cells also hold what lies beyond, so the
+    longest axes are cut until the number of cells is in proportion.
     """
     limit = max(MOST_CELLS_PER_PARTICLE * count, MOST_CELLS_AT_LEAST)
     extent = np.maximum(np.asarray(upper, np.float64) - lower, 0.0)
