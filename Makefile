@@ -41,7 +41,7 @@ $(READY): setup.py constraints.txt Makefile
 	  echo "making $(VENV) with $$($$python --version)"; \
 	  rm -rf $(VENV); $$python -m venv $(VENV) || exit 1; \
 	fi
-	@echo "installing into $(VENV): one to three minutes, about 1.5 GB"
+	@echo "installing into $(VENV): one to three minutes, about 1.2 GB"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	  --constraint constraints.txt --editable '.[ros,test]'
 	@echo "$(CURDIR)" > $@
