@@ -175,17 +175,19 @@ class WebViewer(Node):
 def _panel_text(status, facts):
     """Diagnostics of the fluid as Markdown."""
     age = [
-        f"{key[9:]} {_number(value)} s" for key, value in facts.items() if key[:9] == "pose_age_"
+        f"{key.removeprefix('pose_age_')} {_number(value)} s ago"
+        for key, value in facts.items()
+        if key.startswith("pose_age_") and value != "nan"
     ]
     lines = [
         f"{facts['particles']} particles, {_number(facts['real_time_factor'])} x real time",
         f"step {_number(facts['step_time_ms'])} ms, surface {_number(facts['surface_time_ms'])} ms",
         f"compression {100.0 * float(facts['mean_compression']):.2f} %",
-        f"last pose: {', '.join(age)}" if age else "",
+        f"last pose: {', '.join(age)}" if age else "no pose yet",
     ]
     alert = status.level != DiagnosticStatus.OK
     head = f"**{status.message}**" if alert else status.message
-    return "\n\n".join(line for line in [head, *lines] if line)
+    return "\n\n".join([head, *lines])
 
 
 def _number(text):
