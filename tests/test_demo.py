@@ -80,14 +80,15 @@ def wait_for(condition, process, tmp_path, timeout=90.0):
 
 def test_headless_leaves_a_video_a_picture_and_a_bag(scene, tmp_path):
     out = tmp_path / "out"
-    demo = start_demo(tmp_path, "--headless", "--scene", scene, "--seconds", "1.5", "--out", out)
+    demo = start_demo(tmp_path, "--headless", "--scene", scene, "--seconds", "0.6", "--out", out)
     assert demo.wait(120.0) == 0, (tmp_path / "log.txt").read_text()
     assert group_members(demo.pid) == []
     assert sorted(path.name for path in out.iterdir()) == ["bag", "demo.mp4", "last.png"]
     with open_bag(out / "bag") as bag:
         clouds = [cdr_to_particle_cloud(m.data) for m in bag.messages(["/fluid/particles"])]
         assert {"/fluid/surface", "/fluid/solids", "/fluid/solids/ball/pose"} <= set(bag.topics)
-        assert bag.topics["/fluid/solids/ball/wrench"].count == len(clouds)
+        # Discovery decides which topic is heard first.
+        assert abs(bag.topics["/fluid/solids/ball/wrench"].count - len(clouds)) <= 3
     span = (clouds[-1].header.stamp_ns - clouds[0].header.stamp_ns) / NANOSECONDS
     film = cv2.VideoCapture(str(out / "demo.mp4"))
     assert abs(film.get(cv2.CAP_PROP_FRAME_COUNT) - (30.0 * span + 1)) <= 1

@@ -25,7 +25,10 @@ from msg_adapters.mesh import cdr_to_mesh
 from msg_adapters.point_cloud import cdr_to_particle_cloud
 from msg_adapters.pose import pose_to_cdr
 from msg_adapters.wrench import cdr_to_wrench
+from sph_ros.core.surface import extract_surface
 from sph_ros.nodes.poses import OLDER_POSES_OF_A_RESTART, PoseGate, PoseRefusedError
+from sph_ros.nodes.publications import Publications, SurfaceJob
+from sph_ros.nodes.runner import Runner
 from sph_ros.nodes.schedules import ClockSchedule, WallSchedule
 from sph_ros.sim.simulation import Simulation
 
@@ -46,15 +49,6 @@ solids:
     sphere: {radius: 0.025}
     pose: {position: [0.06, 0.06, 0.16]}
     control: topic
-"""
-
-DRY_SCENE = """
-spacing: 0.02
-time_step: 0.005
-emitters:
-  - {position: [0, 0, 0.2], radius: 0.03, speed: 1.0, from: 1000.0}
-solids:
-  - {name: ball, sphere: {radius: 0.02}, control: topic}
 """
 
 
@@ -194,6 +188,7 @@ def test_surface_is_closed_and_the_same_as_marker_and_mesh(fresh):
     fresh.ros.wait_for(lambda: len(fresh.meshes) >= 2 and len(fresh.surfaces) >= 2)
     assert len(fresh.meshes) == 2  # surface_rate is half of publish_rate
     marker = cdr_to_marker(fresh.surfaces[1])
+    marker_time = (marker.stamp_ns, marker.frame_id)
     vertices, triangles = cdr_to_mesh(fresh.meshes[1])
     assert (marker.type, marker.frame_id, marker.color[3] > 0.0) == (TRIANGLE_LIST, "world", True)
     assert np.array_equal(marker.points, vertices[triangles].reshape(-1, 3))
@@ -201,7 +196,11 @@ def test_surface_is_closed_and_the_same_as_marker_and_mesh(fresh):
     assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
     a, b, c = vertices[triangles].transpose(1, 0, 2)
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
-    assert 0.8 < volume / (0.12 * 0.12 * 0.08) < 1.5  # positive: outward
+    assert 0.5 < volume / (0.12 * 0.12 * 0.08) < 1.5  # positive: outward
+    cloud = next(c for c in map(cdr_to_particle_cloud, fresh.particles) if c.header == marker_time)
+    expected = extract_surface(cloud.positions, 0.02, 0.04)
+    assert np.array_equal(vertices, expected.vertices.astype(float))
+    assert np.array_equal(triangles, expected.triangles)
 
 
 BAD_POSES = {
@@ -373,16 +372,18 @@ def test_clock_mode_follows_the_clock_and_starts_over_when_it_jumps_back(scene_p
 # ---------------------------------------------------------------- no liquid, mistakes, faults
 
 
-def test_no_liquid_deletes_the_surface(tmp_path):
-    path = tmp_path / "dry.yaml"
-    path.write_text(DRY_SCENE)
+def test_no_liquid_deletes_the_surface(scene_path):
     with RosSession("dry") as ros:
-        client = FluidClient(ros, f"scene:={path}", "step_mode:=lockstep")
-        assert len(cdr_to_particle_cloud(client.turn((0.0, 0.0, 0.1))).ids) == 0
-        ros.wait_for(lambda: client.surfaces and client.meshes)
-        marker = cdr_to_marker(client.surfaces[0])
-        assert (marker.action, len(marker.points)) == (DELETE, 0)
-        assert [len(part) for part in cdr_to_mesh(client.meshes[0])] == [0, 0]
+        surfaces = ros.collect(Marker, "/dry/surface", raw=True)
+        meshes = ros.collect(Mesh, "/dry/surface_mesh", raw=True)
+        publications = Publications(ros.node, Runner(str(scene_path), {}))
+        publishers = [ros.node.count_publishers(f"/dry/{n}") for n in ("surface", "surface_mesh")]
+        assert publishers == [1, 1]
+        nothing = SurfaceJob(np.empty((0, 3), np.float32), 5)
+        ros.wait_for(lambda: publications.surface(nothing) == 0 and surfaces and meshes)
+        marker = cdr_to_marker(surfaces[0])
+        assert (marker.action, len(marker.points), marker.stamp_ns) == (DELETE, 0, 5)
+        assert [len(part) for part in cdr_to_mesh(meshes[0])] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -408,25 +409,26 @@ def test_mistakes_are_one_line_and_exit_status_1(parameter, expected, tmp_path):
     assert len(output.strip().splitlines()) == 1, output
 
 
-def test_a_fault_of_the_solver_stops_the_liquid_but_not_the_node(scene_path, monkeypatch):
+@pytest.mark.parametrize("broken", ["step", "densities"])
+def test_a_fault_stops_the_liquid_but_not_the_node(broken, scene_path, monkeypatch):
     from rclpy.parameter import Parameter as NodeParameter
 
     from sph_ros.nodes.fluid_node import FluidNode
 
     with RosSession("fault") as ros:
         reports = ros.collect(DiagnosticArray, "/diagnostics")
+        ros.collect(PointCloud2, "/fluid/particles", raw=True)
         overrides = [NodeParameter("scene", value=str(scene_path))]
         node = ros.add(FluidNode(context=ros.context, parameter_overrides=overrides))
-        step = Simulation.step
 
         def fail(_sim):
             raise ArithmeticError("the liquid exploded")
 
-        monkeypatch.setattr(Simulation, "step", fail)
+        monkeypatch.setattr(Simulation, broken, fail if broken == "step" else property(fail))
         level = lambda: reports and reports[-1].status[0].level  # noqa: E731
         ros.wait_for(lambda: level() == DiagnosticStatus.ERROR, what="for the error")
         assert "the liquid exploded" in reports[-1].status[0].message
-        monkeypatch.setattr(Simulation, "step", step)
+        monkeypatch.undo()
         assert ros.call(Trigger, "/fluid/reset", Trigger.Request()).success
         ros.wait_for(lambda: level() != DiagnosticStatus.ERROR, what="for the recovery")
         assert node.get_name() == "fluid"

@@ -15,6 +15,9 @@ from msg_adapters.header import NANOSECONDS
 #: A state that does not change is published so often [s], for those who come later.
 KEEPALIVE = 1.0
 
+#: A thread that does not step looks around so often [s]; calls wake it.
+IDLE = 0.5
+
 #: Weight of the newest measurement in the running mean of the pace.
 PACE_WEIGHT = 0.2
 
@@ -176,16 +179,25 @@ class ThreadDriver:
         self._schedule.restart(self._runner.sim.time)
         while not self._stopping:
             self._wake.clear()  # before looking for calls, or one that comes now would wait
-            self._run_calls()
-            if self.paused or self._runner.fault:
-                self._schedule.restart(self._runner.sim.time)
-                self._pace_mark = None
-                wait = 0.5
-            else:
-                wait = self._step_if_due()
-            wait = min(wait, self._publish_if_due())
+            try:
+                wait = self._turn()
+            except Exception as error:  # a thread that dies is noticed by nobody
+                self._runner.fail(error)
+                self._report(self._runner.fault)
+                wait = IDLE
             if wait > 0.0 and not self._stopping:
                 self._wake.wait(wait)
+
+    def _turn(self):
+        """Do what is due; returns how long there is nothing to do [s]."""
+        self._run_calls()
+        if self.paused or self._runner.fault:
+            self._schedule.restart(self._runner.sim.time)
+            self._pace_mark = None
+            wait = IDLE
+        else:
+            wait = self._step_if_due()
+        return min(wait, self._publish_if_due())
 
     def _run_calls(self):
         while self._calls:

@@ -218,10 +218,11 @@ class FluidNode(Node):
         """Called by the driver."""
         try:
             job = self._publications.state(stamp_ns, surface_due)
-        except Exception:
-            if not self.context.ok():  # it was shut down in the middle
-                return
-            raise
+        except Exception as error:
+            if self.context.ok():  # else it was shut down in the middle
+                self._runner.fail(error)
+                self._log_fault(self._runner.fault)
+            return
         if job is None:
             return
         if self._step_mode == "lockstep":
@@ -230,7 +231,9 @@ class FluidNode(Node):
             self._surfaces.submit(job)
 
     def _log_fault(self, fault):
-        self.get_logger().error(f"the simulation stopped: {fault}; call ~/reset")
+        self.get_logger().error(
+            f"the simulation stopped: {fault}; call ~/reset", throttle_duration_sec=WARNING_PERIOD
+        )
 
     def _warn_of_surface(self, text):
         if self.context.ok():

@@ -51,7 +51,7 @@ class Runner:
         try:
             self.sim.step()
         except Exception as error:  # whatever it is, the node must stay reachable
-            self.fault = f"{type(error).__name__}: {error}"
+            self.fail(error)
             return False
         self._count(time.perf_counter() - begin)
         for index, name in enumerate(self.sim.solid_names):
@@ -60,6 +60,10 @@ class Runner:
             self._wrenches[index, 3:] += torque
         self._wrench_steps += 1
         return True
+
+    def fail(self, error):
+        """Note what went wrong; nothing is stepped until the next reset."""
+        self.fault = f"{type(error).__name__}: {error}"
 
     def reset(self):
         """Back to the scene's start; mends a fault."""
