@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a grey picture to the poses of the camera and of the solids, picture after picture."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from sph_ros.tracking.ambiguity import ChoiceSettings, PoseChooser, Prediction
+from sph_ros.tracking.detection import Detector, merged_regions, region_around
+from sph_ros.tracking.filter import Measurement
+from sph_ros.tracking.limits import Limiter, Limits
+from sph_ros.tracking.pose import estimate_poses
+from sph_ros.tracking.se3 import IDENTITY, Pose, composed_covariance, inverse_covariance
+from sph_ros.tracking.targets import Target, check_targets
+from sph_ros.tracking.tracks import TrackSettings, make_track
+
+#: Stamps that jump back further [s] begin another recording; smaller ones are stragglers.
+RESTART_JUMP = 0.5
+
+#: A target that was lost so recently [s] is looked for in every picture.
+RECENTLY = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerSettings:
+    """What to look for, and how to follow it.
+
+    Attributes:
+        solids: Targets that drive solids.
+        world: Target that defines the world's frame; None: the camera's own frame.
+        dictionary: of the markers.
+        filter: one of `tracks.FILTERS`.
+        track: TrackSettings.
+        choice: ChoiceSettings.
+        limits: Limits of what comes out of the Kalman filter; None for no bounds.
+        corner_noise: standard deviation of a corner along x and y [pixels].
+        world_hold: so long after the world marker was last seen the camera is taken as still [s].
+        search_interval: the whole picture is searched for missing targets so often [s].
+        full_interval: the whole picture is searched at least so often [s]; 0 for every picture.
+    """
+
+    solids: tuple = ()
+    world: Target | None = None
+    dictionary: str = "DICT_4X4_50"
+    filter: str = "kalman"
+    track: TrackSettings = field(default_factory=TrackSettings)
+    choice: ChoiceSettings = field(default_factory=ChoiceSettings)
+    limits: Limits | None = field(default_factory=Limits)
+    corner_noise: float = 0.3
+    world_hold: float = 3.0
+    search_interval: float = 0.1
+    full_interval: float = 1.0
+
+
+class Tracked(NamedTuple):
+    """A target in one picture.
+
+    Attributes:
+        name: of the target.
+        status: tracking, coasting, lost, never seen, or no world.
+        pose: in the world's frame, of a solid; world_from_camera for the world's target. None when
+            it is not known or too old.
+        covariance: of the pose, (6, 6), see `se3`.
+        in_camera: camera_from_target, filtered; None when not known.
+        residual: root mean square corner error in this picture [pixels]; NaN when not seen.
+        rejected: measurements refused so far.
+        age: since it was last seen [s].
+        motion: weights of the filter's kinds of motion.
+    """
+
+    name: str
+    status: str
+    pose: Pose | None
+    covariance: np.ndarray | None
+    in_camera: Pose | None
+    residual: float
+    rejected: int
+    age: float
+    motion: np.ndarray
+
+
+class Tracking(NamedTuple):
+    """All about one picture.
+
+    Attributes:
+        world: Tracked of the world's target; None without one.
+        solids: name -> Tracked.
+        detections: what was found.
+        regions: where; None for the whole picture.
+        problems: what is wrong, for people.
+    """
+
+    world: Tracked | None
+    solids: dict
+    detections: list
+    regions: list | None
+    problems: list
+
+
+class Tracker:
+    """Follows targets through pictures of one camera.
+
+    Args:
+        settings: TrackerSettings.
+
+    Raises:
+        TargetError, DictionaryError: the settings contradict themselves.
+    """
+
+    def __init__(self, settings):
+        self.settings = settings
+        self._targets = (*settings.solids, *((settings.world,) if settings.world else ()))
+        check_targets(self._targets)
+        ids = [i for target in self._targets for i in target.ids]
+        self._detector = Detector(settings.dictionary, ids)
+        self.reset()
+
+    def reset(self):
+        """Forget everything seen."""
+        self._time = self._first_stamp = None
+        self._last_full = self._last_search = -math.inf
+        self._followed = {
+            t.name: _Followed(t, self.settings, bounded=t is not self.settings.world)
+            for t in self._targets
+        }
+
+    def process(self, gray, stamp_ns, camera, lookahead=0.0):
+        """Where everything is.
+
+        Args:
+            gray: picture (H, W) uint8.
+            stamp_ns: when it was taken [ns].
+            camera: CameraModel of this picture.
+            lookahead: poses are predicted so far beyond the stamp [s].
+
+        Returns:
+            Tracking; None for a picture that is not newer than the last one.
+
+        Raises:
+            CameraError: the calibration is for another size.
+        """
+        camera.check_size(gray.shape[1], gray.shape[0])
+        if not self._advance(stamp_ns):
+            return None
+        regions = self._regions(gray.shape, camera)
+        detections = self._detector.detect(gray, regions)
+        return self.track(detections, camera, self._time, lookahead)._replace(regions=regions)
+
+    def track(self, detections, camera, time, lookahead=0.0):
+        """The same from detections; times [s] must increase."""
+        self._time = time
+        detections, problems = self._unique(detections, camera, time)
+        by_id = {detection.id: detection for detection in detections}
+        world = self._observe_world(by_id, camera, time, lookahead)
+        base = self._camera_from_world(time)
+        solids = {}
+        for target in self.settings.solids:
+            followed = self._followed[target.name]
+            followed.observe_in(base, by_id, camera, time)
+            solids[target.name] = followed.tracked(base, time, lookahead)
+        if world is not None and base is None:
+            problems.append(self._world_problem(world))
+        return Tracking(world, solids, detections, None, problems)
+
+    def _advance(self, stamp_ns):
+        """Set the time of a picture; whether it is newer than the last one."""
+        if self._first_stamp is None:
+            self._first_stamp = stamp_ns
+        time = (stamp_ns - self._first_stamp) * 1e-9
+        if self._time is not None and time <= self._time:
+            if self._time - time < RESTART_JUMP:
+                return False
+            self.reset()
+            self._first_stamp, time = stamp_ns, 0.0
+        self._time = time
+        return True
+
+    # ---------------------------------------------------------------- where to look
+
+    def _regions(self, shape, camera):
+        """Regions of interest; None when the whole picture is to be searched."""
+        settings, time = self.settings, self._time
+        ages = [followed.track.age(time) for followed in self._followed.values()]
+        frame = self._frame_time()
+        missing = [age for age in ages if age > 1.5 * frame]
+        urgent = any(age < RECENTLY for age in missing)
+        due = time - self._last_search >= settings.search_interval - 0.5 * frame
+        full = time - self._last_full >= settings.full_interval or urgent or (missing and due)
+        regions = [] if full else self._predicted_regions(shape, camera)
+        if full or not regions:
+            self._last_full = self._last_search = time
+            return None
+        return merged_regions(regions)
+
+    def _frame_time(self):
+        """Usual time between pictures [s]."""
+        before = getattr(self, "_previous", None)
+        self._previous = self._time
+        if before is not None and 0.0 < self._time - before < 0.2:
+            self._interval = self._time - before
+        return getattr(self, "_interval", 1.0 / 30.0)
+
+    def _predicted_regions(self, shape, camera):
+        base = self._camera_from_world(self._time)
+        regions = []
+        for followed in self._followed.values():
+            prediction = followed.prediction(base, self._time)
+            if prediction is None or followed.track.age(self._time) > RECENTLY:
+                continue
+            points = prediction.pose.apply(followed.target.points(followed.target.ids))
+            if points[:, 2].min() > 0.01:
+                regions.append(region_around(camera.project(points), shape))
+        return [r for r in regions if r[2] - r[0] > 8 and r[3] - r[1] > 8]
+
+    # ---------------------------------------------------------------- what was found
+
+    def _unique(self, detections, camera, time):
+        """Each id once: of several the one where the target should be, else none."""
+        counts = Counter(detection.id for detection in detections)
+        problems = []
+        for marker_id in [i for i, count in counts.items() if count > 1]:
+            same = [d for d in detections if d.id == marker_id]
+            kept = self._nearest(marker_id, same, camera, time)
+            detections = [d for d in detections if d.id != marker_id or d is kept]
+            what = "none is used" if kept is None else "the nearest to where it was is used"
+            problems.append(f"marker {marker_id} was seen {len(same)} times: {what}")
+        return detections, problems
+
+    def _nearest(self, marker_id, detections, camera, time):
+        followed = next(f for f in self._followed.values() if marker_id in f.target.corners)
+        prediction = followed.prediction(self._camera_from_world(time), time)
+        if prediction is None or followed.track.age(time) > self.settings.track.lost_time:
+            return None
+        points = prediction.pose.apply(followed.target.corners[marker_id])
+        if points[:, 2].min() <= 0.01:
+            return None
+        pixels = camera.project(points)
+        return min(detections, key=lambda d: float(np.abs(d.corners - pixels).max()))
+
+    # ---------------------------------------------------------------- world
+
+    def _observe_world(self, by_id, camera, time, lookahead):
+        world = self.settings.world
+        if world is None:
+            return None
+        followed = self._followed[world.name]
+        followed.observe_in((IDENTITY, np.zeros((6, 6))), by_id, camera, time)
+        return followed.as_world(time, self.settings.world_hold)
+
+    def _camera_from_world(self, time):
+        """(Pose, covariance) of the world in the camera's frame; None when not known."""
+        if self.settings.world is None:
+            return IDENTITY, np.zeros((6, 6))
+        followed = self._followed[self.settings.world.name]
+        if followed.track.age(time) > self.settings.world_hold:
+            return None
+        estimate = followed.track.at(time)
+        return estimate.pose, estimate.covariance[:6, :6]
+
+    def _world_problem(self, world):
+        ids = ", ".join(map(str, self.settings.world.ids[:5]))
+        if world.age == math.inf:
+            return f"the world marker (id {ids}) was never seen, so no pose can be given"
+        return f"the world marker (id {ids}) was not seen for {world.age:.1f} s"
+
+
+class _Followed:
+    """One target: its chooser, its track, its limiter."""
+
+    def __init__(self, target, settings, bounded):
+        self.target = target
+        self.track = make_track(settings.filter, settings.track)
+        self._settings = settings
+        self._chooser = PoseChooser(settings.choice)
+        limited = bounded and settings.filter == "kalman" and settings.limits is not None
+        self._limiter = Limiter(settings.limits) if limited else None
+        self._residual = math.nan
+
+    def prediction(self, base, time):
+        """Prediction in the camera's frame; None when nothing is known.
+
+        Args:
+            base: (camera_from_reference, covariance) of the frame in which the track runs.
+            time: [s].
+        """
+        estimate = self.track.at(time)
+        if base is None or estimate is None:
+            return None
+        if self.target is self._settings.world:
+            return Prediction(estimate.pose, estimate.covariance[:6, :6])
+        covariance = composed_covariance(*base, estimate.pose, estimate.covariance[:6, :6])
+        return Prediction(base[0] @ estimate.pose, covariance)
+
+    def observe_in(self, base, by_id, camera, time):
+        """Measure in the camera's frame, filter in the reference frame."""
+        self._residual = math.nan
+        detections = [by_id[i] for i in self.target.ids if i in by_id]
+        if not detections:
+            return
+        solutions = estimate_poses(self.target, detections, camera, self._settings.corner_noise)
+        if not solutions:
+            return
+        self._residual = solutions[0].residual
+        if base is None:
+            return
+        lost = self.track.age(time) > self._settings.track.lost_time
+        choice = self._chooser.choose(solutions, None if lost else self.prediction(base, time))
+        solution, (camera_from_reference, covariance) = choice.solution, base
+        reference_from_camera = camera_from_reference.inverse()
+        back = inverse_covariance(camera_from_reference, covariance)
+        measurement = Measurement(
+            reference_from_camera @ solution.pose,
+            composed_covariance(reference_from_camera, back, solution.pose, solution.covariance),
+        )
+        (self.track.restart if choice.flipped else self.track.observe)(time, measurement)
+
+    def tracked(self, base, time, lookahead):
+        """Tracked of a solid."""
+        status = self.track.status(time)
+        estimate = self.track.at(time + lookahead)
+        pose = covariance = in_camera = None
+        if estimate is not None:
+            if status != "lost":
+                pose, covariance = self._bounded(estimate, time), estimate.covariance[:6, :6]
+            if base is not None:
+                in_camera = base[0] @ self.track.at(time).pose
+        if base is None:
+            status = "no world"
+        return self._make(status, pose, covariance, in_camera, time, estimate)
+
+    def as_world(self, time, hold):
+        """Tracked of the world's target: its pose is the camera's in the world."""
+        estimate = self.track.at(time)
+        pose = covariance = in_camera = None
+        if estimate is not None and self.track.age(time) <= hold:
+            in_camera = estimate.pose
+            pose = in_camera.inverse()
+            covariance = inverse_covariance(in_camera, estimate.covariance[:6, :6])
+        return self._make(self.track.status(time), pose, covariance, in_camera, time, estimate)
+
+    def _bounded(self, estimate, time):
+        if self._limiter is None:
+            return estimate.pose
+        return self._limiter.follow(time, estimate.pose, estimate.velocity, estimate.spin)
+
+    def _make(self, status, pose, covariance, in_camera, time, estimate):
+        weights = np.ones(1) if estimate is None else estimate.weights
+        return Tracked(
+            self.target.name,
+            status,
+            pose,
+            covariance,
+            in_camera,
+            self._residual,
+            self.track.rejected,
+            self.track.age(time),
+            weights,
+        )
