@@ -109,14 +109,14 @@ def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
 
 
 @inlined
-def combine_contacts(contacts, i, begin, end):
+def combine_contacts(contacts, packing, i, begin, end):
     """Product rule over the contacts of particle i: densities and gradients."""
     terms = contacts.terms
     free, near_free = np.float32(1.0), np.float32(1.0)
     for k in range(begin, end):
         free *= np.float32(1.0) - terms[k, FRACTION]
         near_free *= np.float32(1.0) - terms[k, NEAR_FRACTION]
-    contacts.density[i, 0] = np.float32(1.0) - free
+    contacts.density[i, 0] = packing * (np.float32(1.0) - free)
     contacts.density[i, 1] = np.float32(1.0) - near_free
     for axis in range(6):
         contacts.gradients[i, axis] = 0.0
@@ -127,14 +127,31 @@ def combine_contacts(contacts, i, begin, end):
                 others *= np.float32(1.0) - terms[other, FRACTION]
                 near_others *= np.float32(1.0) - terms[other, NEAR_FRACTION]
         for axis in range(3):
-            terms[k, GRADIENT + axis] *= others
+            terms[k, GRADIENT + axis] *= packing * others
             terms[k, NEAR_GRADIENT + axis] *= near_others
             contacts.gradients[i, axis] += terms[k, GRADIENT + axis]
             contacts.gradients[i, 3 + axis] += terms[k, NEAR_GRADIENT + axis]
 
 
+@device
+def find_contacts_of_chunk(chunk, positions, shapes, motion, inverse_step, packing, contacts):
+    """`find_contacts` for one chunk of particles; a function of its own compiles much faster."""
+    solids = motion.position.shape[0]
+    cursor = chunk * CHUNK * solids
+    for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        contacts.start[i] = cursor
+        for s in range(solids):
+            if add_contact(
+                shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
+            ):
+                cursor += 1
+        contacts.end[i] = cursor
+        combine_contacts(contacts, packing, i, contacts.start[i], cursor)
+
+
 @parallel_kernel
-def find_contacts(positions, shapes, motion, inverse_step, chunks, contacts):
+def find_contacts(positions, shapes, motion, inverse_step, packing, chunks, contacts):
     """Contacts of all particles with the solids at the end of the substep.
 
     Args:
@@ -142,24 +159,13 @@ def find_contacts(positions, shapes, motion, inverse_step, chunks, contacts):
         shapes: packed shapes of the S solids.
         motion: poses of the solids.
         inverse_step: 1 / substep [1/s], float32.
+        packing: rest density of the lattice over that of the liquid (`scales.packing`) [-],
+            float32.
         chunks: `chunk_count(N)`.
         contacts: all written; needs room for chunks * CHUNK * S contacts.
     """
-    count = positions.shape[0]
-    solids = motion.position.shape[0]
-    starts, ends = contacts.start, contacts.end
     for chunk in prange(chunks):
-        cursor = chunk * CHUNK * solids
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-            starts[i] = cursor
-            for s in range(solids):
-                if add_contact(
-                    shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
-                ):
-                    cursor += 1
-            ends[i] = cursor
-            combine_contacts(contacts, i, starts[i], cursor)
+        find_contacts_of_chunk(chunk, positions, shapes, motion, inverse_step, packing, contacts)
 
 
 @inlined
@@ -340,6 +346,75 @@ def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
     return False, x, y, z
 
 
+@inlined
+def slide_past_solids(
+    i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
+):
+    """Let particle i slide past each solid once; whether any was in its way.
+
+    Each particle keeps a slightly different margin, so that two that are pushed into the same
+    corner do not end up in the same place, where nothing could part them.
+    """
+    moved = False
+    golden = np.float32(0.618034) * np.float32(i % 4096)
+    margin *= np.float32(1.0) + np.float32(0.5) * (golden - np.floor(golden))
+    for s in range(motion.position.shape[0]):
+        x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
+        sx, sy, sz = starts[i, 0], starts[i, 1], starts[i, 2]
+        ax, ay, az = to_solid(motion.old_rotation, motion.old_position, s, sx, sy, sz)
+        bx, by, bz = to_solid(motion.rotation, motion.position, s, x, y, z)
+        cx, cy, cz = slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest)
+        if cx == bx and cy == by and cz == bz:
+            continue
+        moved = True
+        wx, wy, wz = to_world(motion.rotation, motion.position, s, cx, cy, cz)
+        if planar:
+            wy = y
+        ends[i, 0], ends[i, 1], ends[i, 2] = wx, wy, wz
+        fx, fy, fz = scale * (x - wx), scale * (y - wy), scale * (z - wz)
+        add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz)
+    return moved
+
+
+@inlined
+def keep_chunk_outside(
+    chunk,
+    starts,
+    ends,
+    origins,
+    contacts,
+    near_only,
+    shapes,
+    motion,
+    margin,
+    spacing,
+    planar,
+    scale,
+    reactions,
+):
+    """`keep_outside` for one chunk of particles; returns how many had to be rescued."""
+    shortest = np.float32(0.1) * spacing
+    slack = np.float32(0.5) * margin
+    rescued = 0
+    for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, starts.shape[0])):
+        moved = not near_only or contacts.start[i] < contacts.end[i]
+        rounds = 0
+        while moved and rounds < 8:
+            moved = slide_past_solids(
+                i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
+            )
+            rounds += 1
+        x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
+        if not moved or is_free(shapes, motion, x, y, z, slack):
+            continue
+        rescued += 1
+        found, px, py, pz = nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar)
+        if found:
+            ends[i, 0], ends[i, 1], ends[i, 2] = px, py, pz
+            origins[i, 0], origins[i, 1], origins[i, 2] = px, py, pz
+    return rescued
+
+
 @parallel_kernel
 def keep_outside(
     starts,
@@ -378,55 +453,19 @@ def keep_outside(
         reactions: as in `pressure_reactions`; added to.
         squeezed: particles per chunk that had no way out but a rescue, (chunks,) int64; added to.
     """
-    count = starts.shape[0]
-    solids = motion.position.shape[0]
-    shortest = np.float32(0.1) * spacing
     for chunk in prange(reactions.shape[0]):
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            rounds = 0
-            moved = not near_only or contacts.start[i] < contacts.end[i]
-            while moved and rounds < 8:
-                moved = False
-                for s in range(solids):
-                    x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
-                    ax, ay, az = to_solid(
-                        motion.old_rotation,
-                        motion.old_position,
-                        s,
-                        starts[i, 0],
-                        starts[i, 1],
-                        starts[i, 2],
-                    )
-                    bx, by, bz = to_solid(motion.rotation, motion.position, s, x, y, z)
-                    cx, cy, cz = slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest)
-                    if cx == bx and cy == by and cz == bz:
-                        continue
-                    moved = True
-                    wx, wy, wz = to_world(motion.rotation, motion.position, s, cx, cy, cz)
-                    if planar:
-                        wy = y
-                    ends[i, 0], ends[i, 1], ends[i, 2] = wx, wy, wz
-                    add_reaction(
-                        reactions,
-                        chunk,
-                        s,
-                        motion,
-                        x,
-                        y,
-                        z,
-                        scale * (x - wx),
-                        scale * (y - wy),
-                        scale * (z - wz),
-                    )
-                rounds += 1
-            if not moved:
-                continue
-            x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
-            slack = np.float32(0.5) * margin
-            if is_free(shapes, motion, x, y, z, slack):
-                continue
-            squeezed[chunk] += 1
-            found, px, py, pz = nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar)
-            if found:
-                ends[i, 0], ends[i, 1], ends[i, 2] = px, py, pz
-                origins[i, 0], origins[i, 1], origins[i, 2] = px, py, pz
+        squeezed[chunk] += keep_chunk_outside(
+            chunk,
+            starts,
+            ends,
+            origins,
+            contacts,
+            near_only,
+            shapes,
+            motion,
+            margin,
+            spacing,
+            planar,
+            scale,
+            reactions,
+        )

@@ -9,11 +9,14 @@ walking the set bits of the comparison's mask. Both give the same list in the sa
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba import types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 LANES = 16
+
+#: Numba is told to interpret: the vector code becomes a plain loop.
+INTERPRETED = bool(config.DISABLE_JIT)
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
@@ -114,3 +117,17 @@ def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cu
         return _store_set_bits(builder, bits, first, target_pointer, cursor_)
 
     return signature, codegen
+
+
+def _append_within_plainly(xs, ys, zs, begin, end, x, y, z, square, target, cursor):
+    """What `append_within` does, one point after the other."""
+    for k in range(begin, min(begin + LANES, end)):
+        dx, dy, dz = x - xs[k], y - ys[k], z - zs[k]
+        if dx * dx + dy * dy + dz * dz < square:
+            target[cursor] = k
+            cursor += 1
+    return cursor
+
+
+if INTERPRETED:
+    append_within = _append_within_plainly

@@ -311,10 +311,9 @@ def intersection_terms(full_cover, a, b):
 @inlined
 def solid_terms(shapes, solid, x, y, z):
     """(f, fx, fy, fz, g, gx, gy, gz) of a whole solid: its program on a stack of four."""
-    first, last = shapes.solid_start[solid], shapes.solid_start[solid + 1]
-    t0 = leaf_terms(shapes, first, x, y, z)  # every program begins with a leaf
-    t1 = t2 = t3 = t0
-    for node in range(first + 1, last):
+    o = _ZERO
+    t0 = t1 = t2 = t3 = (o, o, o, o, o, o, o, o)
+    for node in range(shapes.solid_start[solid], shapes.solid_start[solid + 1]):
         op = shapes.node_op[node]
         if op < UNION:
             t3, t2, t1 = t2, t1, t0

@@ -9,25 +9,22 @@ from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import relaxation as relax
 from sph_ros.core.weights import DENSITY_POWER
-from sph_ros.sim.scales import solver_scales
+from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
+from sph_ros.sim.scales import packing, solver_scales
 from sph_ros.sim.state import Workspace, make_grid
+from sph_ros.sim.viscosity import apply_viscosity
 
 #: Pressure iterations end when the mean density error is below this share of the allowed
-#: compression ...
+#: compression. Looser, the errors keep a tank at rest in motion.
 TOLERANCE = 0.02
-#: ... and after at least and at most so many.
-LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
-
-#: Share of the Jacobi correction taken in each iteration. One half (Ihmsen et al. 2014) diverges
-#: for some packings.
-JACOBI_SHARE = np.float32(0.4)
 
 #: Distance that particles keep from solids, as a share of the spacing.
 MARGIN = 0.05
 
-#: Above this the linear viscosity is solved implicitly: explicit it would overshoot.
-EXPLICIT_VISCOSITY = 0.15
-VISCOSITY_TOLERANCE, VISCOSITY_ITERATIONS = 1e-4, 100
+#: Viscosity between liquid and a solid that fills the support, as a multiple of that of one
+#: neighbour: (1 - r/h) summed over the layers of the lattice in its place, a third of it along the
+#: wall.
+WALL_LAYERS = 10.0
 
 
 class UnstableError(RuntimeError):
@@ -52,6 +49,8 @@ class RelaxationSolver:
         self._gravity = np.asarray(scene.gravity, np.float32)
         self._h = np.float32(scene.support_radius)
         self._work = Workspace(0, len(solids))
+        self._packing = packing(scene, 0.0)
+        self._share = FIRST_SHARE
         self.set_material(scene.material)
         self.iterations = 0
         self.density_error = 0.0
@@ -64,11 +63,21 @@ class RelaxationSolver:
         self._material = material
         self.scales = solver_scales(material, self._scene, self._depth)
 
-    def step(self, fluid, time_step):
+    def state(self):
+        """What a later step depends on beside the fluid, for a snapshot."""
+        return {"fastest": self.fastest, "share": self._share, "packing": self._packing}
+
+    def set_state(self, state):
+        """Inverse of `state`."""
+        self.fastest, self._share = state["fastest"], state["share"]
+        self._packing = state["packing"]
+
+    def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
 
         Args:
             fluid: changed in place.
+            time: since the start of the simulation [s].
             time_step: [s].
 
         Returns:
@@ -78,6 +87,7 @@ class RelaxationSolver:
             UnstableError: a position is not a number.
         """
         self._prepare(fluid)
+        self._packing = packing(self._scene, time)
         self._clock("start")
         self._predict(fluid, time_step)
         self._sort(fluid)
@@ -189,6 +199,7 @@ class RelaxationSolver:
                 self._solids.packed,
                 self._solids.motion,
                 np.float32(1.0 / time_step),
+                np.float32(self._packing),
                 work.chunks,
                 work.contacts,
             )
@@ -204,7 +215,7 @@ class RelaxationSolver:
         search.sum_densities(
             work.columns,
             self._h,
-            np.float32(self.scales.density_scale),
+            np.float32(self.scales.density_scale * self._packing),
             np.float32(self.scales.near_scale),
             work.contacts.density,
             work.pairs,
@@ -215,7 +226,7 @@ class RelaxationSolver:
         return relax.Tension(
             np.float32(self.scales.cohesion * unit),
             np.float32(self.scales.near * unit),
-            np.float32(self.scales.near_virial_ratio),
+            np.float32(self.scales.near_virial_ratio * self._packing),
             np.float32(self._material.adhesion),
         )
 
@@ -223,10 +234,10 @@ class RelaxationSolver:
         """Displacements by cohesion and by the pressures that they end up with."""
         work, scales = self._work, self.scales
         gradients = work.contacts.gradients
-        unit = time_step**2 / (scales.rest_density * scales.virial)
+        unit = time_step**2 / (scales.rest_density * scales.virial * self._packing)
         tension = self._tension(unit)
         if scales.cohesion > 0.0:
-            ratio = 1.5 * scales.near_scale / scales.density_scale
+            ratio = 1.5 * scales.near_scale / (scales.density_scale * self._packing)
             relax.cohesive_displacements(
                 work.pairs, work.sums, gradients, tension, np.float32(ratio), work.cohesive
             )
@@ -235,7 +246,10 @@ class RelaxationSolver:
         compliance = np.float32(1.0 / (scales.stiffness * unit))
         relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
-        self._solve_pressures(gradients, compliance)
+        goal = TOLERANCE * self._material.compression
+        self.iterations, self.density_error, self._share = solve_pressures(
+            work, gradients, compliance, goal, self._share
+        )
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         touch.pressure_reactions(
             work.predicted,
@@ -247,41 +261,6 @@ class RelaxationSolver:
             np.float32(scales.mass / time_step**2),
             work.reactions,
         )
-
-    def _solve_pressures(self, gradients, compliance):
-        """Scaled pressures and their displacements, to the tolerance or the most iterations."""
-        work = self._work
-        work.guesses[:] = work.scaled
-        tolerance = TOLERANCE * self._material.compression * work.count
-        inertia, before = 1.0, np.inf
-        for iteration in range(1, MOST_ITERATIONS + 1):
-            relax.pressure_displacements(
-                work.pairs, work.guesses, gradients, work.cohesive, work.displacements
-            )
-            grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
-            relax.correct_pressures(
-                work.pairs,
-                work.sums,
-                gradients,
-                work.displacements,
-                work.diagonal,
-                compliance,
-                JACOBI_SHARE,
-                np.float32((inertia - 1.0) / grown),
-                work.scaled,
-                work.guesses,
-                work.errors,
-            )
-            error = float(work.errors.sum())
-            # Extrapolation that made it worse starts over (O'Donoghue & Candes 2015).
-            inertia, before = (1.0 if error > before else grown), error
-            if iteration >= LEAST_ITERATIONS and error <= tolerance:
-                break
-        relax.pressure_displacements(
-            work.pairs, work.scaled, gradients, work.cohesive, work.displacements
-        )
-        self.iterations = iteration
-        self.density_error = error / max(work.count, 1)
 
     def _finish(self, fluid, time_step):
         """Relaxed positions outside all solids, and the velocities that follow from them."""
@@ -305,59 +284,22 @@ class RelaxationSolver:
     def _apply_viscosity(self, fluid, time_step):
         """Viscosity and friction, which change velocities only."""
         work, scales = self._work, self.scales
-        slope = np.float32(DENSITY_POWER * scales.density_scale / self._h)
-        linear = scales.viscous_rate * time_step
-        implicit = linear > EXPLICIT_VISCOSITY
-        quadratic = scales.quadratic * time_step
-        if quadratic > 0.0 or (linear > 0.0 and not implicit):
-            relax.viscous_impulses(
-                work.pairs,
-                fluid.velocities,
-                slope,
-                np.float32(0.0 if implicit else linear),
-                np.float32(quadratic),
-                work.scratch,
-            )
-            fluid.velocities[:] = work.scratch
-        if implicit:
-            self._solve_viscosity(fluid.velocities, slope, np.float32(linear))
+        slope = DENSITY_POWER * scales.density_scale * self._packing / float(self._h)
+        apply_viscosity(
+            work,
+            fluid.velocities,
+            slope,
+            scales.viscous_rate * time_step,
+            scales.quadratic * time_step,
+        )
         if len(self._solids):
-            s = self._scene.spacing
             touch.rub_on_solids(
                 work.predicted,
                 work.contacts,
                 self._solids.motion,
-                np.float32(10.0 * scales.viscous_rate * time_step),
-                np.float32(self._material.wall_friction * time_step / s),
+                np.float32(WALL_LAYERS * scales.viscous_rate * time_step),
+                np.float32(self._material.wall_friction * time_step / self._scene.spacing),
                 np.float32(scales.mass / time_step),
                 fluid.velocities,
                 work.reactions,
             )
-
-    def _solve_viscosity(self, velocities, slope, linear):
-        """Conjugate gradients for v - impulses(v) = present v, from the present v."""
-        work = self._work
-        direction, image, residual = work.cohesive, work.scratch, work.displacements
-
-        def dot(a, b):
-            relax.chunk_dots(a, b, work.errors)
-            return float(work.errors.sum())
-
-        def apply(v):
-            relax.viscous_operator(work.pairs, v, slope, linear, image)
-
-        apply(velocities)
-        np.subtract(velocities, image, out=residual)
-        direction[:] = residual
-        square = dot(residual, residual)
-        goal = VISCOSITY_TOLERANCE**2 * max(dot(velocities, velocities), 1e-30)
-        for _ in range(VISCOSITY_ITERATIONS):
-            if square <= goal:
-                break
-            apply(direction)
-            share = np.float32(square / dot(direction, image))
-            velocities += share * direction
-            residual -= share * image
-            previous, square = square, dot(residual, residual)
-            direction *= np.float32(square / previous)
-            direction += residual

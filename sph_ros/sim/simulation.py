@@ -12,6 +12,7 @@ from sph_ros.sim.relaxation import RelaxationSolver
 from sph_ros.sim.scales import liquid_depth, stable_time_step
 from sph_ros.sim.scene import load_scene
 from sph_ros.sim.scene_types import Scene
+from sph_ros.sim.snapshots import read_snapshot, write_snapshot
 from sph_ros.sim.solids import Solids, Waypoint, checked_pose
 from sph_ros.sim.state import Fluid
 
@@ -84,8 +85,9 @@ class Simulation:
         self._solver.squeezed = 0
         self._reactions[:] = 0.0
         for part in range(count):
-            self._solids.advance(self.time + part * duration, duration, fastest)
-            self._reactions += self._solver.step(self._fluid, duration) / count
+            now = self.time + part * duration
+            self._solids.advance(now, duration, fastest)
+            self._reactions += self._solver.step(self._fluid, now, duration) / count
         self.timings = self._solver.timings
         self._substeps = count
         self._steps += 1
@@ -113,6 +115,34 @@ class Simulation:
         """Back to time zero: the scene's liquid, the scene's poses; the present material stays."""
         self._solids.reset()
         self._start()
+
+    def save(self, path):
+        """Write the whole state to one file; `Simulation.load` goes on from it to the bit."""
+        numbers = {
+            "steps": self._steps,
+            "solver": self._solver.state(),
+            "solids": {solid.name: solid.state() for solid in self._solids},
+        }
+        write_snapshot(path, self.scene, self.material, self._fluid.arrays(), numbers)
+
+    @classmethod
+    def load(cls, path):
+        """A simulation that goes on from a file of `save`.
+
+        Raises:
+            SnapshotError: the file is missing, damaged or something else.
+        """
+        scene, material, arrays, numbers = read_snapshot(path)
+        simulation = cls(scene)
+        simulation._fluid = Fluid.of_arrays(arrays)
+        simulation.material = material
+        simulation._solver.set_material(material)
+        simulation._solver.set_state(numbers["solver"])
+        simulation._steps = numbers["steps"]
+        for name, state in numbers["solids"].items():
+            simulation._solids[name].set_state(state)
+        simulation._solids.settle()
+        return simulation
 
     # ---------------------------------------------------------------- liquid
 

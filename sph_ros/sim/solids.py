@@ -75,6 +75,29 @@ class Solid:
             for frame in self._spec.path
         )
 
+    def state(self):
+        """What changes, as lists of numbers."""
+        return {
+            "position": self.position.tolist(),
+            "quat_xyzw": self.quat_xyzw.tolist(),
+            "velocity": self.velocity.tolist(),
+            "angular_velocity": self.angular_velocity.tolist(),
+            "waypoints": [
+                [w.time, w.position.tolist(), w.quat_xyzw.tolist()] for w in self._waypoints
+            ],
+        }
+
+    def set_state(self, state):
+        """Inverse of `state`."""
+        self.position = np.array(state["position"])
+        self.quat_xyzw = np.array(state["quat_xyzw"])
+        self.velocity = np.array(state["velocity"])
+        self.angular_velocity = np.array(state["angular_velocity"])
+        self._waypoints = deque(
+            Waypoint(time, np.array(position), np.array(quat))
+            for time, position, quat in state["waypoints"]
+        )
+
     def mesh(self):
         """Triangles to draw, solid's frame: vertices (V, 3) float32 [m], triangles (T, 3) int32."""
         return display_mesh(self.shape)
@@ -103,7 +126,7 @@ class Solid:
         self._waypoints.append(waypoint)
 
     def distance_ahead(self, now, duration):
-        """How far a point of the solid has to move in the next `duration` [s] if no limit held [m]."""
+        """How far a point of the solid would move in the next `duration` [s] without limit [m]."""
         position, quat = self._wanted(now, now + duration)
         turn = quaternions.between(self.quat_xyzw, quat)
         return float(np.linalg.norm(position - self.position)) + self._reach * float(
@@ -212,12 +235,16 @@ class Solids:
         """All solids back to the scene's poses."""
         for solid in self:
             solid.reset()
+        self.settle()
+
+    def settle(self):
+        """Take the present poses as those at the start and at the end of a substep."""
         self._write_poses(self.motion.position, self.motion.rotation)
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
 
     def distance_ahead(self, now, duration):
-        """The farthest that any point of a solid has to move in the next `duration` [s] [m]."""
+        """The farthest that a point of any solid would move in the next `duration` [s] [m]."""
         return max((solid.distance_ahead(now, duration) for solid in self), default=0.0)
 
     def advance(self, now, duration, max_speed):

@@ -36,6 +36,18 @@ class Fluid:
         """Number of particles."""
         return len(self.particle)
 
+    def arrays(self):
+        """All arrays by name, for a snapshot."""
+        return dict(vars(self))
+
+    @classmethod
+    def of_arrays(cls, arrays):
+        """The liquid of a snapshot."""
+        fluid = cls(arrays["positions"], arrays["velocities"], arrays["ids"])
+        fluid.pressures = arrays["pressures"]
+        fluid.particle = arrays["particle"]
+        return fluid
+
     def public(self, rows):
         """Copy of an array with a row per particle, in public order."""
         result = np.empty_like(rows)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure `FLOWED_SHARE` of sph_ros.sim.scales: which rest density keeps the level of a column.
+
+A column of lattice particles is shaken and comes to rest. With the lattice's own sum as rest
+density it sinks, because liquid that has flowed packs better. Two runs with different shares give
+the share for which the level stays.
+"""
+
+import numpy as np
+
+from sph_ros.sim import scales
+from sph_ros.sim.simulation import Simulation
+
+SPACING, LAYERS, WIDTH = 0.01, 18, 10
+
+
+def level(dimension, ratio, share):
+    """Height of the topmost layer after shaking and rest, in spacings."""
+    scales.FLOWED_SHARE[dimension] = ((ratio, share),)
+    width, height = WIDTH * SPACING, LAYERS * SPACING
+    simulation = Simulation(
+        {
+            "spacing": SPACING,
+            "dimension": dimension,
+            "support_radius": ratio * SPACING,
+            "material": {"base": "water", "surface_tension": 0.0, "viscosity": 0.02},
+            "liquid": [{"box": {"min": [0, 0, 0], "max": [width, width, height]}}],
+            "solids": [
+                {
+                    "name": "tank",
+                    "container": {"box": {"min": [0, 0, 0], "max": [width, width, 2 * height]}},
+                }
+            ],
+        }
+    )
+    shake = np.random.default_rng(0).normal(0.0, 0.2, (simulation.particle_count, 3))
+    if dimension == 2:
+        shake[:, 1] = 0.0
+    simulation._fluid.velocities += shake.astype(np.float32)
+    simulation.advance(1.5)
+    levels = []
+    for _ in range(20):
+        simulation.step()
+        levels.append(np.percentile(simulation.positions[:, 2], 100 - 50 / LAYERS) / SPACING)
+    return float(np.mean(levels))
+
+
+def main():
+    """Print the table."""
+    print(f"{'dimension':>9} {'h / spacing':>11} {'level, lattice':>14} {'share':>7}")
+    for dimension in (2, 3):
+        for ratio in (1.6, 2.0, 2.5, 3.0):
+            lattice, guess = level(dimension, ratio, 1.0), level(dimension, ratio, 0.95)
+            wanted = LAYERS - 0.5
+            share = 1.0 - 0.05 * (wanted - lattice) / (guess - lattice)
+            print(f"{dimension:>9} {ratio:>11.1f} {lattice:>14.2f} {share:>7.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

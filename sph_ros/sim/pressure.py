@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pressure iterations of the relaxation solver."""
+
+import numpy as np
+
+from sph_ros.core import relaxation as relax
+
+LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
+
+#: Share of the Jacobi correction taken in each iteration. It has to shrink with the number of
+#: neighbours; when iterations diverge it does, for good.
+FIRST_SHARE, SHRINK = 0.4, 0.7
+
+
+def solve_pressures(work, gradients, compliance, goal, share):
+    """Scaled pressures that hold the density, and the displacements they cause.
+
+    Args:
+        work: `Workspace` with pairs, sums, diagonal, cohesive displacements and, in `scaled`, a
+            first guess; `scaled` and `displacements` are written.
+        gradients: of the contacts, (N, 6).
+        compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
+        goal: mean density error to reach [-].
+        share: of the Jacobi correction to take.
+
+    Returns:
+        Iterations taken, mean density error left, share to start from next time.
+    """
+    first = work.scaled.copy()
+    best = np.inf
+    restart = True
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        if restart:
+            work.guesses[:] = work.scaled
+            inertia, before, restart = 1.0, np.inf, False
+        relax.pressure_displacements(
+            work.pairs, work.guesses, gradients, work.cohesive, work.displacements
+        )
+        grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
+        relax.correct_pressures(
+            work.pairs,
+            work.sums,
+            gradients,
+            work.displacements,
+            work.diagonal,
+            compliance,
+            np.float32(share),
+            np.float32((inertia - 1.0) / grown),
+            work.scaled,
+            work.guesses,
+            work.errors,
+        )
+        error = float(work.errors.sum()) / max(work.count, 1)
+        if iteration >= LEAST_ITERATIONS and error <= goal:
+            break
+        if error > 3.0 * best:
+            share *= SHRINK
+            work.scaled[:] = first
+            restart = True
+        # Extrapolation that made it worse starts over (O'Donoghue & Candes 2015).
+        inertia, before = (1.0 if error > before else grown), error
+        best = min(best, error)
+    relax.pressure_displacements(
+        work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+    )
+    return iteration, error, share

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Neighbour lists and densities against all pairs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import naive
+import numpy as np
+import pytest
+
+from sph_ros.core import neighbors as search
+from sph_ros.core import relaxation as relax
+from sph_ros.core.weights import lattice_sum
+from sph_ros.sim.state import Workspace, make_grid
+
+H = np.float32(0.02)
+FULL = lattice_sum(2, 0.02, 0.01, 3)
+NEAR_FULL = lattice_sum(3, 0.02, 0.01, 3)
+
+
+def cloud(name, count=400, seed=0):
+    generator = np.random.default_rng(seed)
+    points = generator.uniform(0.0, 0.08, (count, 3))
+    if name == "stray":
+        points[7] = [1e4, -3e3, 500.0]
+        points[8] = [-0.5, 0.0, 2.0]
+    if name == "coincident":
+        points[10] = points[11] = points[12]
+    if name == "planar":
+        points[:, 1] = 0.0
+    if name == "dense":
+        points *= 0.2
+    if name == "single":
+        points = points[:1]
+    return points.astype(np.float32)
+
+
+def searched(points):
+    """Sorted positions, the work arrays with lists and sums, and the sort order."""
+    work = Workspace(len(points), 0, pairs_per_particle=8)
+    lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
+    assert search.bounding_box(points, lower, upper) == -1
+    grid = make_grid(lower, upper, float(H), len(points))
+    search.sort_by_cell(points, grid, work.cell_of, work.order)
+    search.gather_rows(work.order, points, work.predicted)
+    search.transpose(work.predicted, work.columns)
+    while search.find_neighbors(work.columns, grid, H, work.chunks, work.pairs):
+        work.enlarge_pairs()
+    search.sum_densities(
+        work.columns,
+        H,
+        np.float32(1 / FULL),
+        np.float32(1 / NEAR_FULL),
+        work.contacts.density,
+        work.pairs,
+        work.sums,
+    )
+    return work
+
+
+CLOUDS = ["uniform", "stray", "coincident", "planar", "dense", "single"]
+
+
+@pytest.mark.nojit
+@pytest.mark.parametrize("name", CLOUDS)
+def test_lists_are_those_of_all_pairs(name):
+    points = cloud(name, count=60 if os.environ.get("NUMBA_DISABLE_JIT") else 400)
+    work = searched(points)
+    assert sorted(work.order) == list(range(len(points)))
+    near = naive.pairs_within(work.predicted, float(H))
+    for i in range(len(points)):
+        found = work.pairs.neighbors[work.pairs.start[i] : work.pairs.end[i]]
+        assert len(set(found)) == len(found)
+        assert set(found) == set(np.nonzero(near[i])[0])
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_densities_are_those_of_all_pairs(name):
+    work = searched(cloud(name))
+    x = work.predicted
+    expected = naive.densities(x, float(H), 2, FULL)
+    np.testing.assert_allclose(work.sums.density, expected, rtol=2e-5)
+    np.testing.assert_allclose(
+        work.sums.near_density, naive.densities(x, float(H), 3, NEAR_FULL), rtol=2e-5
+    )
+    total = naive.gradients(x, float(H), 2, FULL).sum(axis=1)
+    scale = np.abs(total).max() + 1.0
+    np.testing.assert_allclose(work.sums.gradient / scale, total / scale, atol=2e-5)
+
+
+def test_displacements_are_those_of_all_pairs_and_keep_momentum():
+    work = searched(cloud("uniform"))
+    pressures = np.random.default_rng(1).uniform(0, 1e-5, 400).astype(np.float32)
+    relax.pressure_displacements(
+        work.pairs, pressures, work.contacts.gradients, work.cohesive, work.displacements
+    )
+    expected = naive.pressure_displacements(work.predicted, pressures, float(H), FULL)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(work.displacements / scale, expected / scale, atol=1e-5)
+    moved = np.abs(work.displacements).sum(dtype=np.float64)
+    assert np.abs(work.displacements.sum(axis=0, dtype=np.float64)).max() < 1e-6 * moved
+
+
+def test_a_stray_particle_needs_no_larger_grid():
+    points = cloud("stray")
+    grid = make_grid(points.min(axis=0), points.max(axis=0), float(H), len(points))
+    assert int(np.prod(grid.counts)) <= 1 << 16
+
+
+def test_first_position_that_is_no_number_is_named():
+    points = cloud("uniform")
+    points[123, 1] = np.nan
+    box = np.empty(3, np.float32), np.empty(3, np.float32)
+    assert search.bounding_box(points, *box) == 123
+
+
+def test_processors_without_compressing_store_find_the_same_lists(tmp_path):
+    """The other branch of the vector code, in a fresh interpreter that is told to take it."""
+    script = (
+        "import sph_ros.core.vector as v; v.HAS_COMPRESSING_STORE = False\n"
+        "import numpy as np, test_neighbors as t\n"
+        "w = t.searched(t.cloud('uniform'))\n"
+        f"np.savez(r'{tmp_path / 'lists.npz'}', *[w.pairs.neighbors[a:b]"
+        " for a, b in zip(w.pairs.start, w.pairs.end)])\n"
+    )
+    folder = Path(__file__).parent
+    environment = dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(folder.parent)])
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=120)
+    work = searched(cloud("uniform"))
+    with np.load(tmp_path / "lists.npz") as other:
+        for i in range(400):
+            mine = work.pairs.neighbors[work.pairs.start[i] : work.pairs.end[i]]
+            np.testing.assert_array_equal(mine, other[f"arr_{i}"])
