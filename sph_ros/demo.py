@@ -216,10 +216,12 @@ def _record_bag(options, scene, hand, writer, seconds):
         children = stack.enter_context(Children())
         watch = stack.enter_context(Recorder())
         _start_fluid(children, watch, options)
-        watch.record(writer, scene)
-        _wait_for_particles(children, watch)
+        watch.listen(scene)
+        _wait_for(children, watch, "/fluid/particles")
         if hand is not None:
             _start_hand(children, hand, options)
+            _wait_for(children, watch, hand[-1].partition(":=")[2])
+        watch.record(writer)
         end = time.monotonic() + seconds
         factors = []
         bar = "recording {l_bar}{bar}| {n:.0f}/{total:.0f} s {postfix}"
@@ -236,11 +238,12 @@ def _record_bag(options, scene, hand, writer, seconds):
         return mean, watch.counts.get("/fluid/particles", 0)
 
 
-def _wait_for_particles(children, watch):
+def _wait_for(children, watch, topic):
+    """Until a first message of a topic was heard."""
     deadline = time.monotonic() + MOST_DISCOVERY
-    while "/fluid/particles" not in watch.counts:
+    while topic not in watch.counts:
         if time.monotonic() > deadline:
-            raise DemoError(f"no particles within {MOST_DISCOVERY:g} s; does DDS work here?")
+            raise DemoError(f"nothing on {topic} within {MOST_DISCOVERY:g} s; does DDS work here?")
         watch.spin(0.05)
         children.check()
 

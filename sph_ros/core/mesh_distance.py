@@ -358,33 +358,3 @@ def signed_distance_grid(triangles, origin, cell, shape, band):
     distance = exact.astype(np.float32)
     apply_signs(build_cluster_tree(triangles), origin, cell, distance)
     return distance
-
-
-@parallel_kernel
-def cover_sums(distance, cell, reach, offsets, weights, sums):  # the last one is written
-    """Weighted share of material around every node that is within reach of the surface.
-
-    Args:
-        distance: signed, at the nodes [m], (nx, ny, nz) float32; no material outside the grid.
-        cell: spacing of the nodes [m].
-        reach: nodes farther from the surface stay as they are [m].
-        offsets: nodes within the support, (K, 3) int32.
-        weights: their weights for the density and near-density, (K, 2) float32.
-        sums: (nx, ny, nz, 2) float32.
-    """
-    nx, ny, nz = distance.shape
-    for i in prange(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if abs(distance[i, j, k]) >= reach:
-                    continue
-                f = g = np.float32(0.0)
-                for n in range(offsets.shape[0]):
-                    ni, nj, nk = i + offsets[n, 0], j + offsets[n, 1], k + offsets[n, 2]
-                    if not (0 <= ni < nx and 0 <= nj < ny and 0 <= nk < nz):
-                        continue
-                    part = min(max(0.5 - distance[ni, nj, nk] / cell, 0.0), 1.0)
-                    f += np.float32(part) * weights[n, 0]
-                    g += np.float32(part) * weights[n, 1]
-                sums[i, j, k, 0] = f
-                sums[i, j, k, 1] = g

@@ -2,6 +2,7 @@
 """Watches a fluid node: whether it is there, how it is and, if asked to, all it says."""
 
 import time
+from functools import partial
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,6 +20,8 @@ from msg_adapters.point_cloud import POINT_CLOUD2
 from msg_adapters.pose import POSE_STAMPED
 from msg_adapters.wrench import WRENCH_STAMPED
 
+DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
+
 #: Messages of some megabytes arrive in bursts while the bag is being written.
 DEPTH = 10
 
@@ -28,7 +31,7 @@ class Recorder:
 
     Attributes:
         facts: newest diagnostics of the simulation, key -> text.
-        counts: recorded messages, topic -> number.
+        counts: messages heard, topic -> number.
     """
 
     def __enter__(self):
@@ -57,9 +60,8 @@ class Recorder:
         """Whether the fluid node has got past its compilation."""
         return self._node.count_publishers("/fluid/particles") > 0
 
-    def record(self, bag, scene):
-        """From now on write the fluid's messages and the poses it gets to an open BagWriter."""
-        self._bag = bag
+    def listen(self, scene):
+        """Subscribe to the fluid's messages and the poses it gets, and count them."""
         self._subscribe(PointCloud2, POINT_CLOUD2, "/fluid/particles")
         self._subscribe(Marker, MARKER, "/fluid/surface")
         self._subscribe(MarkerArray, MARKER_ARRAY, "/fluid/solids")
@@ -69,19 +71,23 @@ class Recorder:
                 topic = f"/fluid/solids/{solid.name}/pose"
                 self._subscribe(PoseStamped, POSE_STAMPED, topic, ReliabilityPolicy.BEST_EFFORT)
 
+    def record(self, bag):
+        """From now on write what is heard to an open BagWriter; counts begin at zero."""
+        self._bag = bag
+        self.counts = {}
+
     def _subscribe(self, message_class, type_name, topic, policy=ReliabilityPolicy.RELIABLE):
-        def write(data):
-            self.counts[topic] = self.counts.get(topic, 0) + 1
+        qos = QoSProfile(depth=DEPTH, reliability=policy)
+        keep = partial(self._keep, topic, type_name)
+        self._node.create_subscription(message_class, topic, keep, qos, raw=True)
+
+    def _keep(self, topic, type_name, data):
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+        if self._bag is not None:
             self._bag.write(topic, type_name, time.time_ns(), bytes(data))
 
-        qos = QoSProfile(depth=DEPTH, reliability=policy)
-        self._node.create_subscription(message_class, topic, write, qos, raw=True)
-
     def _keep_facts(self, data):
-        if self._bag is not None:
-            self.counts["/diagnostics"] = self.counts.get("/diagnostics", 0) + 1
-            type_name = "diagnostic_msgs/msg/DiagnosticArray"
-            self._bag.write("/diagnostics", type_name, time.time_ns(), bytes(data))
+        self._keep("/diagnostics", DIAGNOSTIC_ARRAY, data)
         for status in deserialize_message(data, DiagnosticArray).status:
             if status.name == "fluid: simulation":
                 self.facts = {item.key: item.value for item in status.values}

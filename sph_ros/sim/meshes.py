@@ -20,11 +20,10 @@ import numpy as np
 
 from sph_ros.core.mesh_distance import (
     build_cluster_tree,
-    cover_sums,
     signed_distance_grid,
     winding_numbers,
 )
-from sph_ros.core.wall_tables import POWERS
+from sph_ros.core.wall_tables import POWERS, flat_integral
 from sph_ros.sim.shape_types import Mesh
 
 #: Share of samples beside the surface that may be neither clearly inside nor clearly outside.
@@ -36,8 +35,11 @@ MAX_GRID_NODES = 128**3
 #: Triangles of a mesh at most: ten times what can be sampled within a minute.
 MAX_TRIANGLES = 2_000_000
 
+#: Nodes per support radius from where sums over nodes are as good as integrals.
+FINE_STENCIL = 12
+
 _SAMPLES = 2000
-_GRID_VERSION = b"sph_ros distance grid 1"
+_GRID_VERSION = b"sph_ros distance grid 2"
 _LOG = logging.getLogger(__name__)
 
 
@@ -318,19 +320,32 @@ def grid_layout(surface: Surface, support_radius: float, spacing: float):
 
 
 def _support_stencil(support_radius: float, cell: float):
-    """Nodes within the support (K, 3) int32, and their weights for both powers (K, 2)."""
+    """Offsets of a cube of nodes around the support (n, n, n, 3) and both weights (n, n, n, 2)."""
     reach = int(support_radius / cell)
     axis = np.arange(-reach, reach + 1)
-    offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    q = np.linalg.norm(offsets, axis=1) * cell / support_radius
-    weights = np.stack([np.maximum(1.0 - q, 0.0) ** power for power in POWERS], axis=1)
-    inside = q < 1.0
-    return offsets[inside].astype(np.int32), weights[inside].astype(np.float32)
+    offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    q = np.linalg.norm(offsets, axis=-1) * cell / support_radius
+    weights = np.stack([np.maximum(1.0 - q, 0.0) ** power for power in POWERS], axis=-1)
+    return offsets, weights
+
+
+def _cover_sums(distance, cell, weights):
+    """Weighted share of material around every node, (nx, ny, nz, 2); none outside the grid."""
+    from scipy.signal import fftconvolve  # slow to import, and many scenes have no mesh
+
+    cover = np.clip(0.5 - distance / cell, 0.0, 1.0)
+    sums = [fftconvolve(cover, weights[..., channel], mode="same") for channel in range(2)]
+    return np.maximum(np.stack(sums, axis=-1), 0.0)
 
 
 def _flat_sums(offsets, weights, cell, support_radius):
-    """`cover_sums` of flat walls over their distance, mean over directions: (d, sums (D, 2))."""
+    """`_cover_sums` of flat walls over their distance, mean over directions: (d, sums (D, 2))."""
     distance = np.linspace(-support_radius, support_radius, 129)
+    if support_radius > FINE_STENCIL * cell:
+        flat = flat_integral(distance, support_radius, 3)
+        return distance, flat / flat[0] * weights.sum(axis=(0, 1, 2))
+    inside = weights[..., 0] > 0.0
+    offsets, weights = offsets[inside], weights[inside]
     index = np.arange(64) + 0.5  # Fibonacci directions
     z, turn = 1.0 - index / 32.0, index * np.pi * (1.0 + 5.0**0.5)
     flat = np.sqrt(1.0 - z * z)
@@ -356,12 +371,11 @@ def _wall_ratio(distance, cell: float, support_radius: float, inverted: bool) ->
     if support_radius < 2.0 * cell:
         return ratio  # too coarse to see edges: every wall counts as flat
     offsets, weights = _support_stencil(support_radius, cell)
-    sums = np.zeros_like(ratio)
-    cover_sums(distance, cell, support_radius, offsets, weights, sums)
+    sums = _cover_sums(distance, cell, weights)
     at, flat = _flat_sums(offsets, weights, cell, support_radius)
     near = np.abs(distance) < support_radius
     for channel in range(2):
-        total = float(weights[:, channel].sum())
+        total = float(weights[..., channel].sum())
         found, expected = sums[near, channel], np.interp(distance[near], at, flat[:, channel])
         if inverted:
             found, expected = total - found, total - expected

@@ -25,6 +25,8 @@ class ChoiceSettings:
         first_evidence: the same just after the start, where the choice was a guess.
         young: number of pictures over which the bound rises from first to full.
         one_picture: most that one picture counts.
+        confidence: most that evidence for the chosen solution counts later, when it may have become
+            the wrong one while both were alike.
         memory: share of the sum that is left at the next picture.
     """
 
@@ -33,6 +35,7 @@ class ChoiceSettings:
     first_evidence: float = 8.0
     young: int = 20
     one_picture: float = 8.0
+    confidence: float = 8.0
     memory: float = 0.95
 
 
@@ -85,7 +88,7 @@ class PoseChooser:
         chosen = int(np.argmin(costs))
         against = float(np.clip(fits[chosen] - fits[1 - chosen], -settings.one_picture,
                                 settings.one_picture))  # fmt: skip
-        self.evidence = settings.memory * self.evidence + against
+        self.evidence = max(settings.memory * self.evidence + against, -settings.confidence)
         flipped = self.evidence > self._bound()
         if flipped:
             chosen = 1 - chosen

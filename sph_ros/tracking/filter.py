@@ -55,7 +55,7 @@ class MotionSettings:
         start_spin: the same [rad/s].
     """
 
-    kinds: tuple = (Motion(), Motion(1.5, 10.0), Motion(6.0, 50.0))
+    kinds: tuple = (Motion(), Motion(1.5, 5.0), Motion(6.0, 50.0))
     acceleration_time: float = 0.1
     kind_time: float = 0.5
     rest_speed: float = 0.02

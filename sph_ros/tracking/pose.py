@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sph_ros.tracking.se3 import Pose, exp, hat
+from sph_ros.tracking.se3 import Pose, difference, exp, hat
 
 #: Two solutions that differ less are one: [m] per metre of distance, and [rad].
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
@@ -22,6 +22,13 @@ PLANAR = 1e-4
 
 #: Least share of a well-known direction's information that any direction gets.
 UNKNOWN = 1e-8
+
+
+#: Steps of Gauss and Newton towards the most probable pose.
+RELINEARIZATIONS = 3
+
+#: More squared error over variance [-] than the best fit has, and the prediction is not believed.
+MISFIT = 30.0
 
 
 class Solution(NamedTuple):
@@ -141,6 +148,43 @@ def _solution(pose, points, pixels, camera, corner_noise):
     inverse = np.linalg.inv(scaled.T @ scaled + UNKNOWN * np.eye(6))
     covariance = variance * inverse * np.outer(scale, scale)
     return Solution(pose, chi_squared, covariance, float(np.sqrt(squares / len(pixels))))
+
+
+def relinearized(solution, prior, target, detections, camera, corner_noise):
+    """The same corners as a measurement linear about what they and the prediction amount to.
+
+    Seen face on, a marker's picture changes with the square of its tilt: about its own solution the
+    corners seem to know the tilt well, although noise alone made it. About the most probable pose
+    they do not (iterated extended Kalman filter, Bell & Cathey 1993).
+
+    Args:
+        solution: a Solution that the corners alone gave.
+        prior: predicted camera_from_target and its covariance (6, 6), as a pair.
+        target, detections, camera, corner_noise: as in `estimate_poses`.
+
+    Returns:
+        (camera_from_target, covariance (6, 6)): those of `solution` where the prediction does not
+        fit the corners.
+    """
+    points = np.ascontiguousarray(target.points([d.id for d in detections]))
+    pixels = np.concatenate([d.corners for d in detections])
+    variance = corner_noise**2 * max(1.0, solution.chi_squared / max(pixels.size - 6, 1) / 4.0)
+    precision = np.linalg.inv(prior[1])
+    pose = prior[0]
+    for iteration in range(RELINEARIZATIONS + 1):
+        projected, jacobian = _project(pose, points, camera)
+        errors = (pixels - projected).ravel()
+        information = jacobian.T @ jacobian / variance
+        pull = jacobian.T @ errors / variance
+        if iteration < RELINEARIZATIONS:
+            back = difference(prior[0], pose)
+            pose = perturbed(pose, np.linalg.solve(information + precision, pull + precision @ back))
+            if not pose.apply(points)[:, 2].min() > 0.0:
+                return solution.pose, solution.covariance
+    if float(errors @ errors) > variance * (solution.chi_squared * corner_noise**2 / variance + MISFIT):
+        return solution.pose, solution.covariance
+    covariance = np.linalg.inv(information + UNKNOWN * np.diag(np.diag(information)))
+    return perturbed(pose, covariance @ pull), covariance
 
 
 def _is_planar(points):

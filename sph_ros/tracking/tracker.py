@@ -12,7 +12,7 @@ from sph_ros.tracking.ambiguity import ChoiceSettings, PoseChooser, Prediction
 from sph_ros.tracking.detection import Detector, merged_regions, region_around
 from sph_ros.tracking.filter import Measurement
 from sph_ros.tracking.limits import Limiter, Limits
-from sph_ros.tracking.pose import estimate_poses
+from sph_ros.tracking.pose import estimate_poses, relinearized
 from sph_ros.tracking.se3 import IDENTITY, Pose, composed_covariance, inverse_covariance
 from sph_ros.tracking.targets import Target, check_targets
 from sph_ros.tracking.tracks import TrackSettings, make_track
@@ -278,6 +278,7 @@ class _Followed:
         limited = bounded and settings.filter == "kalman" and settings.limits is not None
         self._limiter = Limiter(settings.limits) if limited else None
         self._residual = math.nan
+        self._relinearize = settings.filter == "kalman"  # others take a measurement as a pose
 
     def prediction(self, base, time):
         """Prediction in the camera's frame; None when nothing is known.
@@ -307,14 +308,15 @@ class _Followed:
         if base is None:
             return
         lost = self.track.age(time) > self._settings.track.lost_time
-        choice = self._chooser.choose(solutions, None if lost else self.prediction(base, time))
-        solution, (camera_from_reference, covariance) = choice.solution, base
-        reference_from_camera = camera_from_reference.inverse()
-        back = inverse_covariance(camera_from_reference, covariance)
-        measurement = Measurement(
-            reference_from_camera @ solution.pose,
-            composed_covariance(reference_from_camera, back, solution.pose, solution.covariance),
-        )
+        prediction = None if lost else self.prediction(base, time)
+        choice = self._chooser.choose(solutions, prediction)
+        measured = choice.solution.pose, choice.solution.covariance
+        if self._relinearize and prediction is not None and not choice.flipped:
+            noise = self._settings.corner_noise
+            measured = relinearized(
+                choice.solution, prediction, self.target, detections, camera, noise
+            )
+        measurement = _in_reference(base, *measured)
         (self.track.restart if choice.flipped else self.track.observe)(time, measurement)
 
     def tracked(self, base, time, lookahead):
@@ -359,3 +361,14 @@ class _Followed:
             self.track.age(time),
             weights,
         )
+
+
+def _in_reference(base, camera_from_target, covariance):
+    """The Measurement in the frame of which (camera_from_reference, covariance) is given."""
+    camera_from_reference, base_covariance = base
+    reference_from_camera = camera_from_reference.inverse()
+    back = inverse_covariance(camera_from_reference, base_covariance)
+    return Measurement(
+        reference_from_camera @ camera_from_target,
+        composed_covariance(reference_from_camera, back, camera_from_target, covariance),
+    )
