@@ -74,6 +74,7 @@ setup(
         "console_scripts": [
             "fluid_node = sph_ros.nodes.fluid_node:main",
             "bag_player = sph_ros.nodes.bag_player:main",
+            "marker_tracker = sph_ros.nodes.marker_tracker:main",
             "web_viewer = sph_ros.nodes.web_viewer:main",
             "sph_ros = sph_ros.cli:main",
         ],

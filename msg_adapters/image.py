@@ -13,7 +13,8 @@ from msg_adapters.header import Header, read_header, write_header
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 
-# Encoding names of sensor_msgs/image_encodings.hpp that pictures and depth cameras use.
+# Encoding names of sensor_msgs/image_encodings.hpp that pictures and depth cameras use. YUV 4:2:2
+# has two bytes a pixel, the colour of a Bayer pixel depends on its place.
 _ENCODINGS = {
     "mono8": ("u1", 1),
     "rgb8": ("u1", 3),
@@ -27,6 +28,14 @@ _ENCODINGS = {
     "8UC3": ("u1", 3),
     "16UC1": ("u2", 1),
     "32FC1": ("f4", 1),
+    "yuv422": ("u1", 2),
+    "yuv422_yuy2": ("u1", 2),
+    "uyvy": ("u1", 2),
+    "yuyv": ("u1", 2),
+    "bayer_rggb8": ("u1", 1),
+    "bayer_bggr8": ("u1", 1),
+    "bayer_gbrg8": ("u1", 1),
+    "bayer_grbg8": ("u1", 1),
 }
 
 

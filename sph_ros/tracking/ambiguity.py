@@ -30,12 +30,12 @@ class ChoiceSettings:
         memory: share of the sum that is left at the next picture.
     """
 
-    trust: float = 40.0
-    evidence: float = 25.0
+    trust: float = 25.0
+    evidence: float = 16.0
     first_evidence: float = 8.0
     young: int = 20
     one_picture: float = 8.0
-    confidence: float = 8.0
+    confidence: float = 4.0
     memory: float = 0.95
 
 

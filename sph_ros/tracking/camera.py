@@ -123,7 +123,9 @@ def camera_from_fields(
     chosen[:2, 2] = (chosen[:2, 2] + 0.5) / step - 0.5
     chosen[0, :2] /= step[0]
     chosen[1, 1] /= step[1]
-    return CameraModel(int(width) // int(step[0]), int(height) // int(step[1]), chosen, coefficients)
+    return CameraModel(
+        int(width) // int(step[0]), int(height) // int(step[1]), chosen, coefficients
+    )
 
 
 def _check_model(model, distortion):
@@ -167,7 +169,9 @@ def load_camera(path, rectified=False):
         # OpenCV writes a first line that YAML does not allow.
         content = yaml.load(text.removeprefix("%YAML:1.0"), _Loader)
     except (OSError, UnicodeDecodeError) as error:
-        raise CameraError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
+        raise CameraError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', error)})"
+        ) from error
     except yaml.YAMLError as error:
         raise CameraError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
     try:

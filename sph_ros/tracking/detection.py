@@ -74,7 +74,9 @@ class Detector:
         count = len(self._dictionary.bytesList)
         wrong = sorted(i for i in self._ids or () if not 0 <= i < count)
         if wrong:
-            raise DictionaryError(f"marker id {wrong[0]}: {dictionary} has the ids 0 to {count - 1}")
+            raise DictionaryError(
+                f"marker id {wrong[0]}: {dictionary} has the ids 0 to {count - 1}"
+            )
         self._find = _finder(self._dictionary)
 
     def detect(self, gray, regions=None):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounds on the motion that leaves the tracker: whatever comes in, a solid is never made to jump."""
+"""Bounds on the motion that leaves the tracker: whatever comes in, no solid is made to jump."""
 
 import math
 from dataclasses import dataclass

@@ -7,7 +7,7 @@ from sph_ros.tracking.se3 import Pose, exp
 
 
 def smooth_noise(times, rng, band, amplitude, count=8):
-    """Sum of sines of random frequency in `band` [Hz], (N, 3), of standard deviation `amplitude`."""
+    """Sum of sines of random frequency in `band` [Hz], (N, 3), of deviation `amplitude`."""
     frequencies = rng.uniform(*band, (3, count))
     phases = rng.uniform(0.0, 2.0 * np.pi, (3, count))
     angles = 2.0 * np.pi * frequencies * np.asarray(times)[:, None, None] + phases

@@ -107,7 +107,7 @@ def _ippe(points, pixels, camera, method):
 
 
 def _refined(pose, points, pixels, camera):
-    """The pose of least reprojection error near `pose`; None where there is none before the camera."""
+    """The pose of least reprojection error near `pose`; None where it is not before the camera."""
     turn = cv2.Rodrigues(pose.rotation)[0]
     shift = np.array(pose.position).reshape(3, 1)
     try:
@@ -178,10 +178,14 @@ def relinearized(solution, prior, target, detections, camera, corner_noise):
         pull = jacobian.T @ errors / variance
         if iteration < RELINEARIZATIONS:
             back = difference(prior[0], pose)
-            pose = perturbed(pose, np.linalg.solve(information + precision, pull + precision @ back))
+            pose = perturbed(
+                pose, np.linalg.solve(information + precision, pull + precision @ back)
+            )
             if not pose.apply(points)[:, 2].min() > 0.0:
                 return solution.pose, solution.covariance
-    if float(errors @ errors) > variance * (solution.chi_squared * corner_noise**2 / variance + MISFIT):
+    if float(errors @ errors) > variance * (
+        solution.chi_squared * corner_noise**2 / variance + MISFIT
+    ):
         return solution.pose, solution.covariance
     covariance = np.linalg.inv(information + UNKNOWN * np.diag(np.diag(information)))
     return perturbed(pose, covariance @ pull), covariance

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from sph_ros.tracking.detection import get_dictionary, marker_picture
-from sph_ros.tracking.targets import Target
 
 #: White margin around a marker, as a share of its side.
 MARGIN = 0.2
@@ -67,8 +66,8 @@ class SyntheticCamera:
         """One picture (H, W) uint8.
 
         Args:
-            placed: [(Target, camera_from_target)], or with a function from an exposure's share, 0 to
-                1, to the Pose, for motion blur.
+            placed: [(Target, camera_from_target)]; for motion blur with a function to the Pose
+                from a share of the exposure, 0 to 1.
             time: [s], for the change of light.
         """
         flaws = self._flaws
@@ -94,7 +93,9 @@ class SyntheticCamera:
                 camera_from_marker = pose @ target.marker_pose(marker_id)
                 if _faces_camera(camera_from_marker):
                     size = target.marker_size(marker_id)
-                    quads.append((camera_from_marker.position[2], marker_id, camera_from_marker, size))
+                    quads.append(
+                        (camera_from_marker.position[2], marker_id, camera_from_marker, size)
+                    )
         for _, marker_id, pose, size in sorted(quads, key=lambda quad: -quad[0]):
             self._draw_marker(picture, marker_id, pose, size)
         return picture
@@ -123,7 +124,9 @@ class SyntheticCamera:
         """A soft clutter, with false markers where asked for."""
         height, width = self._camera.height, self._camera.width
         coarse = self._random.uniform(90, 200, (height // 40 + 2, width // 40 + 2))
-        picture = cv2.resize(coarse.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        picture = cv2.resize(
+            coarse.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC
+        )
         for number in range(self._flaws.false_markers):
             marker_id = len(self._dictionary.bytesList) - 1 - number
             centre = self._random.uniform(0.15, 0.85, 2) * (width, height)
@@ -136,19 +139,16 @@ class SyntheticCamera:
         height, width = picture.shape
         for _ in range(self._flaws.occlusions):
             centre = self._random.uniform(0, 1, 2) * (width, height)
-            box = (tuple(map(float, centre)), (0.6 * width, 0.04 * width), float(self._random.uniform(0, 180)))
+            box = (
+                tuple(map(float, centre)),
+                (0.6 * width, 0.04 * width),
+                float(self._random.uniform(0, 180)),
+            )
             cv2.fillConvexPoly(picture, cv2.boxPoints(box).astype(np.int32), 60.0)
 
     def _gradient(self):
         width = self._camera.width
         return 1.0 + self._flaws.light_gradient * np.linspace(-0.5, 0.5, width, dtype=np.float32)
-
-
-def single_false_marker(marker_id, size):
-    """A Target that nobody is looking for."""
-    from sph_ros.tracking.targets import UNIT_CORNERS
-
-    return Target("false", {marker_id: size * UNIT_CORNERS})
 
 
 def _faces_camera(pose):

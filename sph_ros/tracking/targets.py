@@ -135,7 +135,9 @@ def load_boards(path):
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise TargetError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
+        raise TargetError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', error)})"
+        ) from error
     except yaml.YAMLError as error:
         raise TargetError(f"{path}: is not YAML ({' '.join(str(error).split())})") from error
     boards = content.get("boards") if isinstance(content, dict) else None

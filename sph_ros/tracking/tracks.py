@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of one target over time: Kalman filter, One Euro filter, or the measurements as they are.
+"""The pose of one target over time: Kalman filter, One Euro filter, or measurements as they are.
 
-All three have the same face: ``observe`` a measurement, ask where the target is ``at`` a time. Times
-are seconds that do not decrease.
+All three have the same face: ``observe`` a measurement, ask where the target is ``at`` a time.
+Times are seconds that do not decrease.
 """
 
 import math
@@ -23,6 +23,7 @@ from sph_ros.tracking.filter import (
 from sph_ros.tracking.se3 import Pose, difference, exp, log
 
 FILTERS = ("kalman", "one_euro", "none")
+
 
 @dataclass(frozen=True)
 class TrackSettings:

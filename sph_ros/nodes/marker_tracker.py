@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``marker_tracker``: pictures of printed markers in, poses of solids out.
+
+Callbacks and sources only leave a picture in a mailbox that holds one; a thread of its own fetches
+it, so that no picture ever waits behind another. While nobody listens no picture is subscribed to
+and no camera is open.
+"""
+
+import sys
+import threading
+import time
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from msg_adapters.image import COMPRESSED_IMAGE, IMAGE, cdr_to_compressed_image, cdr_to_image
+from sph_ros.nodes.image_source import Encoded, Picture, SourceError, make_source
+from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
+from sph_ros.nodes.marker_diagnostics import Problems, input_status, target_status
+from sph_ros.nodes.marker_mailbox import Mailbox
+from sph_ros.nodes.marker_parameters import MEASURED, MarkerParameters, TrackerParameterError
+from sph_ros.nodes.marker_publications import MarkerPublications
+from sph_ros.nodes.running import run_node
+from sph_ros.tracking.camera import CameraError
+from sph_ros.tracking.camera_message import CAMERA_INFO
+from sph_ros.tracking.detection import DictionaryError
+from sph_ros.tracking.drawing import draw_notes, draw_tracking
+from sph_ros.tracking.images import ImageError, decode, to_bgr, to_gray
+from sph_ros.tracking.targets import TargetError
+from sph_ros.tracking.tracker import Tracker
+
+#: Warnings of one kind are at least so far apart [s].
+WARNING_PERIOD = 5.0
+
+#: Without a picture for so long [s] something is wrong with where they come from.
+SILENCE = 2.0
+
+#: How often it is looked whether anybody listens, and what there is to listen to [s].
+ATTENTION_PERIOD = 0.2
+
+#: A picture older than this [s] is a recording; its age says nothing about latency.
+LONGEST_LATENCY = 0.3
+
+
+class MarkerTracker(Node):
+    """The tracker node, named `marker_tracker`.
+
+    Args:
+        kwargs: for `rclpy.node.Node`.
+
+    Raises:
+        TrackerParameterError, TargetError, DictionaryError, SourceError: a parameter is wrong.
+    """
+
+    def __init__(self, **kwargs):
+        super().__init__("marker_tracker", **kwargs)
+        self._running = False
+        self._source = None
+        try:
+            self._set_up()
+        except BaseException:
+            super().destroy_node()
+            raise
+
+    def _set_up(self):
+        cv2.setNumThreads(1)  # the cores belong to the simulation
+        self._settings = parameters = MarkerParameters(self)
+        self._problems = Problems()
+        self._mailbox = Mailbox()
+        self._tracker, self._tracker_error, self._rebuild = None, None, True
+        self._tracking = None
+        self._counts = {"processed": 0, "refused": 0}
+        self._milliseconds, self._size, self._last_picture = 0.0, "", None
+        names = parameters.solid_names()
+        self._publications = MarkerPublications(
+            self, names, parameters["world_frame"], parameters["publish_tf"]
+        )
+        self._input_topics = self._find_topics()
+        from_topics = not parameters.source
+        self._calibration = CalibrationChoice(
+            parameters["camera_info_url"], self._rectified(), expect_messages=from_topics
+        )
+        if not from_topics:
+            self._make_source()  # so that a wrong one is noticed at once
+        self._make_tracker()
+        self._listened = {}
+        self._awake_since = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(ATTENTION_PERIOD, self._attend, clock=steady)
+        self.create_timer(1.0, self._diagnose, clock=steady)
+        parameters.follow(self._settings_changed)
+        self._running = True
+        self._thread = threading.Thread(target=self._work, name="tracker", daemon=True)
+        self._thread.start()
+        where = parameters.source or f"{self._input_topics['image']} and {self._input_topics['camera_info']}"
+        self.get_logger().info(f"tracking {', '.join(names) or 'nothing'} in {where}")
+
+    def destroy_node(self):
+        """End the threads first: they publish."""
+        if self._running:
+            self._running = False
+            self._thread.join(timeout=10.0)
+        self._stop_source()
+        super().destroy_node()
+
+    def _find_topics(self):
+        image = self.resolve_topic_name("image")
+        compressed = self.resolve_topic_name("image/compressed")
+        if compressed == self.resolve_topic_name("image/compressed", only_expand=True):
+            compressed = f"{image}/compressed"  # not remapped itself, so it follows the image
+        return {
+            "image": image,
+            "compressed": compressed,
+            "camera_info": self.resolve_topic_name("camera_info"),
+        }
+
+    def _rectified(self):
+        kind = self._settings["image_kind"]
+        return kind == "rectified" or (kind == "auto" and "rect" in self._input_topics["image"])
+
+    # ---------------------------------------------------------------- listening, only when needed
+
+    def _attend(self):
+        """Open what is needed and close what is not."""
+        awake = not self._settings["lazy"] or self._publications.listeners() > 0
+        if awake and self._awake_since is None:
+            self._awake_since = time.monotonic()
+        elif not awake:
+            self._awake_since = None
+        if self._settings.source:
+            self._attend_source(awake)
+        else:
+            self._attend_topics(awake)
+
+    def _attend_source(self, awake):
+        if awake and self._source is None:
+            self._source = self._make_source()
+            self._source.start()
+        elif not awake:
+            self._stop_source()
+
+    def _make_source(self):
+        get = self._settings
+        return make_source(
+            get.source, self._take, get["source_rate"], get["source_topic"], get["loop"]
+        )
+
+    def _stop_source(self):
+        if self._source is not None:
+            self._source.stop()
+            self._source = None
+
+    def _attend_topics(self, awake):
+        """Hear camera_info always, raw pictures rather than compressed ones."""
+        wanted = {"camera_info": CameraInfo}
+        if awake:
+            raw = self.count_publishers(self._input_topics["image"])
+            compressed = self.count_publishers(self._input_topics["compressed"])
+            if raw or not compressed:
+                wanted["image"] = Image
+            else:
+                wanted["compressed"] = CompressedImage
+        for name in [name for name in self._listened if name not in wanted]:
+            self.destroy_subscription(self._listened.pop(name))
+        for name, message_type in wanted.items():
+            if name not in self._listened:
+                self._hear(name, message_type, reliable=True)
+
+    def _hear(self, name, message_type, reliable):
+        """Subscribe; reliable, since best effort loses large messages, but that gives way."""
+        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+        def give_way(_event):
+            if self._listened.get(name) is subscription:
+                self.destroy_subscription(subscription)
+                self._hear(name, message_type, reliable=False)
+
+        events = SubscriptionEventCallbacks(use_default_callbacks=False)
+        if reliable:
+            # Not in the event's own callback: it belongs to what is destroyed.
+            events.incompatible_qos = lambda event: self.executor.create_task(give_way, event)
+        callbacks = {
+            "camera_info": self._calibration.hear,
+            "image": lambda data: self._take(Encoded(IMAGE, data)),
+            "compressed": lambda data: self._take(Encoded(COMPRESSED_IMAGE, data)),
+        }
+        subscription = self.create_subscription(
+            message_type,
+            self._input_topics[name],
+            callbacks[name],
+            QoSProfile(depth=2, reliability=policy),
+            event_callbacks=events,
+            raw=True,
+        )
+        self._listened[name] = subscription
+
+    def _take(self, thing):
+        """A picture comes, or a bag's camera_info."""
+        if isinstance(thing, Encoded) and thing.type == CAMERA_INFO:
+            self._calibration.hear(thing.data)
+            return
+        self._last_picture = time.monotonic()
+        self._mailbox.put((thing, self.get_clock().now().nanoseconds))
+
+    # ---------------------------------------------------------------- a picture
+
+    def _work(self):
+        """The tracker's thread."""
+        while self._running:
+            thing = self._mailbox.get(timeout=0.1)
+            if thing is None:
+                continue
+            begin = time.perf_counter()
+            try:
+                self._process(*thing)
+                self._counts["processed"] += 1
+            except WaitingError:
+                continue
+            except Exception as error:
+                if not (self._running and self.context.ok()):
+                    return
+                self._counts["refused"] += 1
+                self._complain(_kind(error), " ".join(str(error).split()) or repr(error))
+            spent = 1e3 * (time.perf_counter() - begin)
+            self._milliseconds += 0.1 * (spent - self._milliseconds)
+
+    def _process(self, thing, arrival_ns):
+        pixels, encoding, stamp_ns, frame = _decoded(thing)
+        stamp_ns = stamp_ns or arrival_ns
+        gray = to_gray(pixels, encoding)
+        height, width = gray.shape
+        self._size = f"{width} x {height} {encoding}"
+        picture = None
+        if self._publications.debug_due(self._settings["debug_rate"]):
+            picture = to_bgr(pixels, encoding).copy()
+        try:
+            self._track(gray, stamp_ns, frame, picture)
+        except (CameraError, TargetError, DictionaryError) as error:
+            if picture is not None:
+                self._publications.publish_debug(draw_notes(picture, [str(error)]), stamp_ns, frame)
+            raise
+
+    def _track(self, gray, stamp_ns, frame, picture):
+        camera = self._calibration.for_picture(gray.shape[1], gray.shape[0])
+        note = self._calibration.note(camera)
+        if note:
+            self._complain("approximate", note)
+        tracker = self._current_tracker()
+        tracking = tracker.process(gray, stamp_ns, camera, self._lookahead(stamp_ns))
+        if tracking is None:  # a straggler
+            return
+        self._tracking = tracking
+        world = tracker.settings.world
+        self._publications.publish(tracking, stamp_ns, frame, world is not None)
+        for problem in tracking.problems:
+            self._complain("marker twice" if "times" in problem else "world", problem)
+        if picture is not None:
+            targets = {t.name: t for t in (*tracker.settings.solids, *((world,) if world else ()))}
+            notes = [note] if note else []
+            draw_tracking(picture, tracking, targets, camera, notes)
+            self._publications.publish_debug(picture, stamp_ns, frame)
+
+    def _lookahead(self, stamp_ns):
+        """How far poses are predicted beyond the stamp [s]."""
+        prediction = self._settings["prediction"]
+        if prediction != MEASURED:
+            return max(0.0, prediction)
+        age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        return age if 0.0 <= age <= LONGEST_LATENCY else 0.0
+
+    def _complain(self, kind, text):
+        self._problems.note(kind, text)
+        if kind not in ("world", "approximate") or self._problems.counts[kind] % 150 == 1:
+            self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
+
+    # ---------------------------------------------------------------- parameters
+
+    def _settings_changed(self):
+        self._rebuild = True
+
+    def _make_tracker(self):
+        """A tracker after the present parameters; a wrong marker size may still be mended."""
+        self._rebuild = False
+        try:
+            self._tracker, self._tracker_error = Tracker(self._settings.settings()), None
+        except TargetError as error:
+            self._tracker, self._tracker_error = None, error
+            self.get_logger().error(str(error))
+
+    def _current_tracker(self):
+        if self._rebuild:
+            self._make_tracker()
+        if self._tracker_error is not None:
+            raise self._tracker_error
+        return self._tracker
+
+    # ---------------------------------------------------------------- diagnostics
+
+    def _diagnose(self):
+        if self._diagnostics.get_subscription_count() == 0:
+            return
+        name, idle = self.get_name(), self._awake_since is None
+        problems = {} if idle else {**self._problems.recent(), **self._silence()}
+        if self._rebuild and idle:
+            self._make_tracker()
+        if self._tracker_error is not None:
+            problems["marker size"] = str(self._tracker_error)
+        statuses = [input_status(name, "pictures come", self._facts(), problems, idle)]
+        tracking, tracker = self._tracking, self._tracker
+        if tracker is not None:
+            if tracker.settings.world is not None:
+                world = None if tracking is None else tracking.world
+                statuses.append(target_status(name, "world", world, True))
+            for solid in tracker.settings.solids:
+                tracked = None if tracking is None else tracking.solids.get(solid.name)
+                statuses.append(target_status(name, solid.name, tracked, False))
+        array = DiagnosticArray(status=statuses)
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def _silence(self):
+        """What is wrong when no picture comes."""
+        source = self._source
+        if source is not None and source.problem:
+            return {"source": source.problem}
+        since = max(self._last_picture or 0.0, self._awake_since or 0.0)
+        silent = time.monotonic() - since
+        if silent < SILENCE:
+            return {}
+        where = source.name if source is not None else self._input_topics["image"]
+        return {"silence": f"no picture from {where} for {silent:.0f} s"}
+
+    def _facts(self):
+        return {
+            "source": self._settings.source or self._input_topics["image"],
+            "pictures_processed": self._counts["processed"],
+            "pictures_refused": self._counts["refused"],
+            "pictures_dropped": self._mailbox.dropped,
+            "picture_time_ms": self._milliseconds,
+            "picture": self._size,
+            **{
+                f"problems_{kind.replace(' ', '_')}": n for kind, n in self._problems.counts.items()
+            },
+        }
+
+
+def _decoded(thing):
+    """(pixels, encoding, stamp_ns, frame_id) of what came in."""
+    if isinstance(thing, Picture):
+        return thing.pixels, "bgr8", thing.stamp_ns, "camera"
+    if thing.type == COMPRESSED_IMAGE:
+        message = cdr_to_compressed_image(thing.data)
+        pixels, encoding = decode(message.data, message.format), "bgr8"
+    else:
+        message = cdr_to_image(thing.data)
+        pixels, encoding = message.pixels, message.encoding
+    return pixels, encoding, message.header.stamp_ns, message.header.frame_id or "camera"
+
+
+def _kind(error):
+    for kind, types in (("calibration", CameraError), ("marker size", TargetError)):
+        if isinstance(error, types):
+            return kind
+    return "image" if isinstance(error, ImageError | ValueError | cv2.error) else "fault"
+
+
+def main(argv=None):
+    """Run the node until SIGINT or SIGTERM; returns the exit status."""
+    errors = (TrackerParameterError, TargetError, DictionaryError, SourceError)
+    return run_node("marker_tracker", MarkerTracker, argv, errors)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
