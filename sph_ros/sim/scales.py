@@ -32,8 +32,9 @@ import numpy as np
 
 from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, gradient_sum, lattice_sum
 
-#: Near-stiffness per cohesive stiffness (b above).
-NEAR_SHARE = 1.0
+#: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none, and its
+#: particles clump.
+NEAR_SHARE = 0.3
 
 #: Density of flowed liquid on the lattice's scale, where both have the same volume, over h /
 #: spacing; by dimension. Measured by benchmarks/calibrate_packing.py: the level of a column.
@@ -173,7 +174,7 @@ def stable_time_step(scene, scales, drop):
     bounds = {f"particles up to {speed:.2g} m/s": COURANT * h / speed}
     soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)
     if soft > 0:
-        bounds["surface tension"] = 0.4 * s / soft
+        bounds["surface tension"] = 0.38 * h / soft
     reason = min(bounds, key=bounds.get)
     step = min(bounds[reason], 0.01)
     return (_round_down(step), reason if step == bounds[reason] else "10 ms at most")
