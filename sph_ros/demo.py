@@ -249,7 +249,7 @@ def _wait_for(children, watch, topic):
 
 
 def _draw(bag, scene, folder):
-    from sph_ros.film import make_film
+    from sph_ros.film import film_of_bag
 
     bar = "drawing   {l_bar}{bar}| {n}/{total} frames, {remaining} to go"
     with tqdm(bar_format=bar, disable=None, leave=False) as line:
@@ -259,7 +259,7 @@ def _draw(bag, scene, folder):
             line.update(done - line.n)
 
         video, picture = folder / "demo.mp4", folder / "last.png"
-        return make_film(bag, scene, video, picture, 30.0, VIDEO_SIZE, progress)
+        return film_of_bag(bag, scene, video, picture, VIDEO_SIZE, 30.0, progress)
 
 
 def _check_target(out, force):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded bag of a fluid node as a video."""
+"""A running simulation, or the recorded bag of one, as a video and its last picture."""
 
 import numpy as np
 
@@ -7,51 +7,133 @@ from msg_adapters.bags import open_bag
 from msg_adapters.header import NANOSECONDS
 from msg_adapters.marker import cdr_to_markers
 from msg_adapters.point_cloud import cdr_to_particle_cloud
+from sph_ros.colors import solid_colors
 from sph_ros.core.surface import extract_surface
 from sph_ros.render import Camera, Frame, SolidView, render, save_png
 from sph_ros.render.video import VideoWriter
-from sph_ros.sim.shapes import Container, display_mesh
+from sph_ros.sim.shapes import Container, Plane, display_mesh
 
 
-def make_film(bag, scene, video, picture, fps, size, progress=lambda done, total: None):
-    """Draw the particles and solids of a bag.
+class Film:
+    """Draws states of a scene one after the other; a context manager.
+
+    The camera stands so that the liquid and all visible solids of the first state are in view.
+
+    Args:
+        scene: the Scene.
+        video: path of the .mp4 to write.
+        picture: path of a .png for the last state.
+        size: (width, height) [pixels].
+        fps: pictures per second.
+    """
+
+    def __init__(self, scene, video, picture, size, fps):
+        self._scene, self._size = scene, size
+        self._video, self._picture_path = VideoWriter(video, size, fps), picture
+        self._solids = _Solids(scene)
+        self._camera = self._picture = None
+
+    def __enter__(self):
+        self._video.__enter__()
+        return self
+
+    def __exit__(self, *exception):
+        self._video.__exit__(*exception)
+        if exception[0] is None and self._picture is not None:
+            save_png(self._picture_path, self._picture)
+
+    def add(self, positions, velocities, surface, poses):
+        """Draw a state.
+
+        Args:
+            positions: of the particles [m], (N, 3).
+            velocities: [m/s], (N, 3).
+            surface: of the liquid: (vertices, triangles, normals).
+            poses: name -> (position, quat_xyzw) of solids; those without one are not drawn.
+        """
+        scene = self._scene
+        views = self._solids.views(poses)
+        frame = Frame(
+            positions,
+            velocities,
+            tuple(surface),
+            views,
+            scene.spacing,
+            dimension=scene.dimension,
+        )
+        if self._camera is None:
+            bounds = self._solids.bounds(frame)
+            self._camera = Camera.fit(*bounds, aspect=self._size[0] / self._size[1])
+        self._picture = render(frame, self._camera, self._size)
+        self._video.add(self._picture)
+
+
+class _Solids:
+    """Meshes and colours of a scene's visible solids, looked up once."""
+
+    def __init__(self, scene):
+        self._specs = {spec.name: spec for spec in scene.solids if spec.visible}
+        self._meshes = {name: display_mesh(spec.shape) for name, spec in self._specs.items()}
+        self._colors = solid_colors(scene)
+
+    def views(self, poses):
+        """The visible solids that have a pose."""
+        return [
+            SolidView(
+                name,
+                *self._meshes[name],
+                *poses[name],
+                container=isinstance(spec.shape, Container),
+                color=self._colors[name][:3],
+            )
+            for name, spec in self._specs.items()
+            if name in poses
+        ]
+
+    def bounds(self, frame):
+        """(lower, upper) corner [m] of liquid and solids; planes are endless and do not count."""
+        points = [np.array(frame.bounds())]
+        for view in frame.solids:
+            if not isinstance(self._specs[view.name].shape, Plane):
+                points.append(view.world_vertices())
+        points = np.concatenate(points)
+        return points.min(axis=0), points.max(axis=0)
+
+
+# ---------------------------------------------------------------- from a bag
+
+
+def film_of_bag(bag, scene, video, picture, size, fps, progress=lambda done, total: None):
+    """Draw the particles and solids of a recording with `/fluid/particles` and `/fluid/solids`.
 
     The video runs at the speed of the simulation: a liquid that was computed slower than real time
     is shown at its true speed.
 
     Args:
-        bag: path of a recording with `/fluid/particles` and `/fluid/solids`.
+        bag: path of the recording.
         scene: the Scene that ran.
-        video: path of the .mp4 to write.
-        picture: path of a .png for the last frame.
-        fps: pictures per second of simulated time.
-        size: (width, height) [pixels].
-        progress: called with (frames drawn, frames in all).
+        video, picture, size, fps: as for `Film`.
+        progress: called with (pictures drawn, pictures in all).
 
     Returns:
-        number of frames.
+        number of pictures.
     """
-    solids = _Solids(scene)
-    with open_bag(bag) as reader:
-        clouds = _frames(reader, fps)
-        poses = [_poses(m.data) for m in reader.messages(["/fluid/solids"])]
+    with open_bag(bag) as reader, Film(scene, video, picture, size, fps) as film:
+        clouds = _chosen_clouds(reader, fps)
+        poses = [_poses(message.data) for message in reader.messages(["/fluid/solids"])]
         times = np.array([stamp for stamp, _ in poses])
-        camera = last = None
-        with VideoWriter(video, size, fps) as writer:
-            for done, (stamp_ns, data) in enumerate(clouds, start=1):
-                cloud = cdr_to_particle_cloud(data)
-                nearest = int(np.argmin(np.abs(times - stamp_ns)))
-                frame = _frame(scene, cloud, solids.views(poses[nearest][1]))
-                if camera is None:
-                    camera = Camera.fit(*frame.bounds(), aspect=size[0] / size[1])
-                last = render(frame, camera, size)
-                writer.add(last)
-                progress(done, len(clouds))
-    save_png(picture, last)
+        for done, (stamp_ns, data) in enumerate(clouds, start=1):
+            cloud = cdr_to_particle_cloud(data)
+            surface = extract_surface(
+                cloud.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
+            )
+            nearest = int(np.argmin(np.abs(times - stamp_ns)))
+            film.add(cloud.positions, cloud.velocities, surface, poses[nearest][1])
+            progress(done, len(clouds))
     return len(clouds)
 
 
-def _frames(reader, fps):
+def _chosen_clouds(reader, fps):
     """For every picture (stamp, bytes) of the newest cloud at its time; time never goes back."""
     chosen, tick = [], None
     for message in reader.messages(["/fluid/particles"]):
@@ -65,43 +147,7 @@ def _frames(reader, fps):
 
 
 def _poses(data):
+    """(stamp [ns], {solid: (position, quat_xyzw)}) of an array of markers."""
     markers = cdr_to_markers(data)
     stamp = markers[0].stamp_ns if markers else 0
-    return stamp, {marker.namespace: marker for marker in markers}
-
-
-def _frame(scene, cloud, views):
-    surface = extract_surface(
-        cloud.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
-    )
-    return Frame(
-        cloud.positions,
-        cloud.velocities,
-        tuple(surface),
-        views,
-        scene.spacing,
-        dimension=scene.dimension,
-    )
-
-
-class _Solids:
-    """Meshes of a scene's visible solids, looked up once."""
-
-    def __init__(self, scene):
-        self._specs = [spec for spec in scene.solids if spec.visible]
-        self._meshes = {spec.name: display_mesh(spec.shape) for spec in self._specs}
-
-    def views(self, markers):
-        """The solids where their markers are."""
-        return [
-            SolidView(
-                spec.name,
-                *self._meshes[spec.name],
-                position=markers[spec.name].position,
-                quat_xyzw=markers[spec.name].quat_xyzw,
-                container=isinstance(spec.shape, Container),
-                color=spec.color,
-            )
-            for spec in self._specs
-            if spec.name in markers
-        ]
+    return stamp, {marker.namespace: (marker.position, marker.quat_xyzw) for marker in markers}

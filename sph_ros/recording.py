@@ -1,33 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an offline run leaves behind: a bag, a video with its last picture, a table and a plot."""
+"""What a run leaves behind: a folder that appears when it is complete, a bag, a table."""
 
 import csv
+import os
 import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from msg_adapters.bags import BagWriter
-from msg_adapters.marker import (
-    MARKER,
-    MARKER_ARRAY,
-    delete_marker,
-    marker_to_cdr,
-    markers_to_cdr,
-    triangle_marker,
-)
+from msg_adapters.marker import MARKER, MARKER_ARRAY, marker_to_cdr, markers_to_cdr
 from msg_adapters.point_cloud import POINT_CLOUD2, particle_cloud_to_cdr
 from msg_adapters.pose import POSE_STAMPED, pose_to_cdr
 from msg_adapters.wrench import WRENCH_STAMPED, wrench_to_cdr
-from sph_ros.render import Camera, Frame, SolidView, render, save_png
-from sph_ros.render.video import VideoWriter
-from sph_ros.sim.shapes import Container, Plane
+from sph_ros.scene_markers import SolidMarkers, surface_marker
 
 NODE = "/fluid"
-LIQUID_COLOR = (0.20, 0.45, 0.75, 0.8)
-SOLID_COLOR = (0.85, 0.45, 0.20, 1.0)
-CONTAINER_COLOR = (0.7, 0.7, 0.7, 0.15)
 
 #: Of `Simulation.statistics()`, what the table and the plot show.
 STATISTICS = (
@@ -53,9 +41,8 @@ class ResultFolder:
 
     def __enter__(self):
         self.target.parent.mkdir(parents=True, exist_ok=True)
-        folder = tempfile.mkdtemp(prefix=f".{self.target.name}.", dir=self.target.parent)
-        self.path = Path(folder)
-        self.path.chmod(0o755)  # mkdtemp's folders are for the owner alone
+        self.path = self.target.with_name(f".{self.target.name}.{os.getpid()}")
+        self.path.mkdir()
         return self
 
     def __exit__(self, exception_type, *_):
@@ -77,9 +64,9 @@ class BagRecorder:
     they are large.
     """
 
-    def __init__(self, folder, scene, start_ns):
-        self._folder, self._frame_id, self._start_ns = Path(folder), scene.frame, start_ns
-        self._visible = {solid.name: solid.visible for solid in scene.solids}
+    def __init__(self, folder, sim, start_ns):
+        self._folder, self._frame_id, self._start_ns = Path(folder), sim.scene.frame, start_ns
+        self._sim, self._solids = sim, SolidMarkers(sim)
         self._count = 0
 
     def __enter__(self):
@@ -93,8 +80,9 @@ class BagRecorder:
                 file.replace(self._folder / file.name)
             (self._folder / "result").rmdir()
 
-    def add(self, sim, surface):
+    def add(self, surface):
         """Record the present state; `surface` is (vertices, triangles, normals)."""
+        sim = self._sim
         stamp = self._start_ns + round(sim.time * 1e9)
 
         def write(topic, message_type, data):
@@ -112,103 +100,10 @@ class BagRecorder:
             wrench = wrench_to_cdr(*sim.wrench(name), stamp, self._frame_id)
             write(f"solids/{name}/wrench", WRENCH_STAMPED, wrench)
         if self._count % 2 == 0:
-            write("surface", MARKER, self._surface(surface, stamp))
-            write("solids", MARKER_ARRAY, self._solids(sim, stamp))
+            marker = surface_marker(*surface[:2], stamp, self._frame_id)
+            write("surface", MARKER, marker_to_cdr(marker))
+            write("solids", MARKER_ARRAY, markers_to_cdr(self._solids.at(stamp)))
         self._count += 1
-
-    def _surface(self, surface, stamp):
-        vertices, triangles, _ = surface
-        if len(triangles) == 0:
-            return marker_to_cdr(delete_marker(stamp, self._frame_id, namespace="surface"))
-        marker = triangle_marker(
-            vertices, triangles, stamp, self._frame_id, namespace="surface", color=LIQUID_COLOR
-        )
-        return marker_to_cdr(marker)
-
-    def _solids(self, sim, stamp):
-        markers = []
-        for index, name in enumerate(sim.solid_names):
-            if not self._visible[name]:
-                continue
-            solid = sim.solid(name)
-            vertices, triangles = solid.mesh()
-            markers.append(
-                triangle_marker(
-                    vertices,
-                    triangles,
-                    stamp,
-                    self._frame_id,
-                    namespace=name,
-                    marker_id=index,
-                    color=solid_color(solid),
-                    position=solid.position,
-                    quat_xyzw=solid.quat_xyzw,
-                )
-            )
-        return markers_to_cdr(markers)
-
-
-def solid_color(solid):
-    """Red, green, blue, alpha of a solid: the scene's, or one that suits it."""
-    if isinstance(solid.shape, Container):
-        return CONTAINER_COLOR
-    return (*solid.color, 1.0) if solid.color is not None else SOLID_COLOR
-
-
-class VideoRecorder:
-    """Writes video.mp4 and, at the end, last.png; the camera stands so that all is in view."""
-
-    def __init__(self, folder, sim, size, fps):
-        self._folder, self._size, self._fps = Path(folder), size, fps
-        lower, upper = view_bounds(sim)
-        self._camera = Camera.fit(lower, upper, aspect=size[0] / size[1])
-        self._picture = None
-
-    def __enter__(self):
-        path = self._folder / "video.mp4"
-        self._video = VideoWriter(path, self._size, self._fps).__enter__()
-        return self
-
-    def __exit__(self, *exception):
-        self._video.__exit__(*exception)
-        if exception[0] is None and self._picture is not None:
-            save_png(self._folder / "last.png", self._picture)
-
-    def add(self, sim, surface):
-        """Draw the present state; `surface` is (vertices, triangles, normals)."""
-        self._picture = render(picture_frame(sim, surface), self._camera, self._size)
-        self._video.add(self._picture)
-
-
-def picture_frame(sim, surface=None):
-    """What a picture of the present state shows."""
-    visible = {spec.name for spec in sim.scene.solids if spec.visible}
-    views = []
-    for solid in (sim.solid(name) for name in sim.solid_names if name in visible):
-        view = SolidView(
-            solid.name,
-            *solid.mesh(),
-            position=solid.position,
-            quat_xyzw=solid.quat_xyzw,
-            container=isinstance(solid.shape, Container),
-            color=solid.color,
-        )
-        views.append(view)
-    return Frame(sim.positions, sim.velocities, surface, views, sim.scene.spacing)
-
-
-def view_bounds(sim):
-    """(lower, upper) corner of what a picture should show [m]: liquid and visible solids.
-
-    Planes are endless and do not count.
-    """
-    frame = picture_frame(sim)
-    points = [np.array(frame.bounds())]
-    for view in frame.solids:
-        if not isinstance(sim.solid(view.name).shape, Plane):
-            points.append(view.world_vertices())
-    points = np.concatenate(points)
-    return points.min(axis=0), points.max(axis=0)
 
 
 class History:

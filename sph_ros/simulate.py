@@ -12,7 +12,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from sph_ros.core.surface import extract_surface
-from sph_ros.recording import BagRecorder, History, ResultFolder, VideoRecorder
+from sph_ros.film import Film
+from sph_ros.recording import BagRecorder, History, ResultFolder
 from sph_ros.render.plots import plot_history
 from sph_ros.sim.scene import bag_path, load_scene
 from sph_ros.sim.simulation import Simulation
@@ -120,8 +121,8 @@ def _run(sim, folder, start_ns, wanted, fps, size):
     frame_count = int(wanted * fps + 1e-6) + 1
     with ExitStack() as stack:
         stopped = stack.enter_context(_ctrl_c())
-        bag = stack.enter_context(BagRecorder(folder, sim.scene, start_ns))
-        video = stack.enter_context(VideoRecorder(folder, sim, size, fps)) if size else None
+        bag = stack.enter_context(BagRecorder(folder, sim, start_ns))
+        film = stack.enter_context(_film(sim.scene, folder, size, fps)) if size else None
         bar = tqdm(total=wanted, unit="s", disable=None, leave=False, bar_format=_BAR)
         stack.enter_context(bar)
         for frame in range(frame_count):
@@ -130,10 +131,10 @@ def _run(sim, folder, start_ns, wanted, fps, size):
                 complete = False
                 break
             surface = _surface(sim)
-            bag.add(sim, surface)
+            bag.add(surface)
             history.add(sim)
-            if video:
-                video.add(sim, surface)
+            if film:
+                film.add(sim.positions, sim.velocities, surface, _poses(sim))
             frames += 1
             bar.update(min(sim.time, wanted) - bar.n)
     history.write_csv(folder / "history.csv")
@@ -142,6 +143,16 @@ def _run(sim, folder, start_ns, wanted, fps, size):
 
 
 _BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated, {elapsed} gone, {remaining} to go"
+
+
+def _film(scene, folder, size, fps):
+    return Film(scene, folder / "video.mp4", folder / "last.png", size, fps)
+
+
+def _poses(sim):
+    """Of all solids: name -> (position, quat_xyzw)."""
+    solids = [sim.solid(name) for name in sim.solid_names]
+    return {solid.name: (solid.position, solid.quat_xyzw) for solid in solids}
 
 
 def _surface(sim):

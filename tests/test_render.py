@@ -290,6 +290,8 @@ def test_png_is_read_back_and_leaves_no_other_file(tmp_path):
     save_png(tmp_path / "picture.png", picture)
     assert np.array_equal(cv2.imread(str(tmp_path / "picture.png"))[:, :, ::-1], picture)
     assert [path.name for path in tmp_path.iterdir()] == ["picture.png"]
+    (tmp_path / "other").touch()  # may be read by whoever may read any new file
+    assert (tmp_path / "picture.png").stat().st_mode == (tmp_path / "other").stat().st_mode
     with pytest.raises(OSError):
         save_png(tmp_path / "missing" / "picture.png", picture)
 

@@ -19,7 +19,6 @@ from visualization_msgs.msg import MarkerArray
 from websockets.sync.client import connect
 
 from msg_adapters.marker import cdr_to_markers
-from sph_ros.nodes.web_colors import ramp
 from sph_ros.nodes.web_viewer import ros_arguments
 
 SIZE = (1200, 850)
@@ -173,10 +172,3 @@ def test_command_line_becomes_parameters():
     ]  # fmt: skip
     with pytest.raises(SystemExit):
         ros_arguments(["--prot", "9000"])
-
-
-def test_colours_go_from_deep_blue_to_white_and_stand_nan():
-    colors = ramp(np.array([0.0, 0.5, 1.0, 7.0, -1.0, np.nan])).astype(int)
-    brightness = colors.sum(axis=1)
-    assert brightness[0] < brightness[1] < brightness[2] == brightness[3]
-    assert (colors[4] == colors[0]).all() and (colors[5] == colors[0]).all()

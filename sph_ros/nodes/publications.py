@@ -11,19 +11,15 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msg_adapters.marker import marker_to_cdr, markers_to_cdr, triangle_marker
+from msg_adapters.marker import marker_to_cdr, markers_to_cdr
 from msg_adapters.mesh import mesh_to_cdr
 from msg_adapters.point_cloud import particle_cloud_to_cdr
 from msg_adapters.wrench import wrench_to_cdr
 from sph_ros.core.surface import extract_surface
+from sph_ros.scene_markers import SolidMarkers, surface_marker
 
 #: A depth of one loses messages of some megabytes.
 DEPTH = 2
-
-#: Red, green, blue, alpha.
-LIQUID_COLOR = (0.20, 0.45, 0.75, 0.8)
-SOLID_COLOR = (0.85, 0.45, 0.20, 1.0)
-CONTAINER_COLOR = (0.70, 0.70, 0.70, 0.15)
 
 
 class SurfaceJob(NamedTuple):
@@ -52,7 +48,7 @@ class Publications:
         self._wrenches = [
             create(WrenchStamped, f"~/solids/{name}/wrench") for name in runner.sim.solid_names
         ]
-        self._drawn = [_DrawnSolid(runner.sim, i) for i in _visible(runner.sim.scene)]
+        self._solid_markers = SolidMarkers(runner.sim)
 
     def state(self, stamp_ns, surface_due):
         """Publish particles, solids and wrenches.
@@ -71,8 +67,7 @@ class Publications:
                 )
             )
         if _heard(self._solids):
-            markers = [solid.marker(stamp_ns, self._frame) for solid in self._drawn]
-            self._solids.publish(markers_to_cdr(markers))
+            self._solids.publish(markers_to_cdr(self._solid_markers.at(stamp_ns)))
         self._publish_wrenches(stamp_ns)
         return SurfaceJob(positions, stamp_ns) if wants_surface else None
 
@@ -83,14 +78,7 @@ class Publications:
             job.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
         )
         if _heard(self._surface):
-            marker = triangle_marker(
-                vertices,
-                triangles,
-                job.stamp_ns,
-                self._frame,
-                namespace="surface",
-                color=LIQUID_COLOR,
-            )
+            marker = surface_marker(vertices, triangles, job.stamp_ns, self._frame)
             self._surface.publish(marker_to_cdr(marker))
         if _heard(self._surface_mesh):
             self._surface_mesh.publish(mesh_to_cdr(vertices, triangles))
@@ -102,36 +90,6 @@ class Publications:
             if _heard(publisher):
                 data = wrench_to_cdr(wrench[:3], wrench[3:], stamp_ns, self._frame)
                 publisher.publish(data)
-
-
-class _DrawnSolid:
-    """A solid as a marker; its triangles are looked up once, its pose every time."""
-
-    def __init__(self, sim, index):
-        self._solid = sim.solid(sim.solid_names[index])
-        self._index = index
-        vertices, triangles = self._solid.mesh()
-        self._marker = triangle_marker(
-            vertices,
-            triangles,
-            0,
-            "",
-            namespace=self._solid.name,
-            marker_id=index,
-            color=solid_color(self._solid),
-        )
-        # Fields but not the class: a frozen dataclass copies slower than it is made.
-        self._fields = dict(vars(self._marker))
-
-    def marker(self, stamp_ns, frame):
-        """The solid where it is now."""
-        self._fields.update(
-            stamp_ns=stamp_ns,
-            frame_id=frame,
-            position=tuple(self._solid.position),
-            quat_xyzw=tuple(self._solid.quat_xyzw),
-        )
-        return type(self._marker)(**self._fields)
 
 
 class _Creator:
@@ -147,17 +105,6 @@ class _Creator:
             QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
-
-
-def solid_color(solid):
-    """Red, green, blue, alpha of a solid: the scene's, or one that suits it."""
-    if type(solid.shape).__name__ == "Container":
-        return CONTAINER_COLOR
-    return (*solid.color, 1.0) if solid.color is not None else SOLID_COLOR
-
-
-def _visible(scene):
-    return [index for index, spec in enumerate(scene.solids) if spec.visible]
 
 
 def _heard(publisher):

@@ -12,12 +12,10 @@ import numpy as np
 import trimesh
 import viser
 
-from sph_ros.nodes.web_colors import ramp
+from sph_ros.colors import LIQUID, speed_colors
 
 #: Speed with the lightest colour [m/s]; a fall of 10 cm.
 FAST = 1.4
-
-WATER_RGB = (60, 140, 220)
 
 #: Edges where faces meet at a larger angle [rad] are drawn as lines.
 EDGE_ANGLE = 0.5
@@ -108,7 +106,7 @@ class WebScene:
             self._hide(self._cloud)
             return
         positions = np.ascontiguousarray(positions, np.float32)
-        colors = ramp(np.linalg.norm(velocities, axis=1) / FAST)
+        colors = _bytes(speed_colors(np.linalg.norm(velocities, axis=1) / FAST))
         if self._cloud is None:
             self._point_size.value = round(1e3 * POINT_SHARE * _spacing(positions), 1)
         size = 1e-3 * self._point_size.value
@@ -130,7 +128,12 @@ class WebScene:
         triangles = np.ascontiguousarray(triangles, np.uint32)
         if self._mesh is None:
             self._mesh = self._server.scene.add_mesh_simple(
-                "/surface", vertices, triangles, color=WATER_RGB, opacity=0.45, cast_shadow=False
+                "/surface",
+                vertices,
+                triangles,
+                color=_bytes(LIQUID[:3]),
+                opacity=0.45,
+                cast_shadow=False,
             )
             return
         with self._server.atomic():
@@ -185,6 +188,11 @@ class WebScene:
             handle.visible = False
 
 
+def _bytes(rgb):
+    """Colours 0 to 1 as viser takes them."""
+    return np.round(255.0 * np.asarray(rgb)).astype(np.uint8)
+
+
 def _spacing(positions):
     """Usual distance between particles [m]: median distance of some to their nearest neighbours."""
     some = positions[:: max(1, len(positions) // 20)]
@@ -211,7 +219,7 @@ class _WebSolid:
             f"/solids/{self._name}/mesh",
             mesh.vertices.astype(np.float32),
             mesh.faces.astype(np.uint32),
-            color=tuple(round(255 * value) for value in marker.color[:3]),
+            color=_bytes(marker.color[:3]),
             opacity=None if opacity > 0.99 else opacity,
             side="front" if opacity > TRANSPARENT else "back",
             cast_shadow=opacity > TRANSPARENT,

@@ -2,13 +2,13 @@
 """Pictures of the liquid and the solids, drawn on the CPU without a display."""
 
 import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from sph_ros.colors import LIQUID, SOLIDS, linear, speed_colors
 from sph_ros.render.camera import Camera
 from sph_ros.render.light_map import floor_light
 from sph_ros.render.raster import (
@@ -21,9 +21,6 @@ from sph_ros.render.raster import (
 )
 from sph_ros.render.walls import surface_at_walls
 from sph_ros.render.water import compose
-
-#: Linear RGB of solids that have no colour of their own, in turn.
-SOLID_COLOURS = ((0.80, 0.20, 0.08), (0.85, 0.55, 0.08), (0.20, 0.45, 0.12), (0.35, 0.18, 0.50))
 
 #: Edges between faces that differ by more than this angle are outlines and keep flat shading [deg].
 CREASE_ANGLE = 35.0
@@ -146,26 +143,23 @@ def save_png(path, picture) -> None:
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]))
     if not done:
         raise OSError(f"{path}: picture of shape {picture.shape} cannot be encoded as PNG")
-    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    # Not through tempfile, whose files nobody else may read.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.png")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(encoded.tobytes())
-        os.replace(name, path)
+        temporary.write_bytes(encoded.tobytes())
+        os.replace(temporary, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
-def speed_colours(velocities, count, top_speed=None) -> np.ndarray:
-    """Linear RGB per particle: deep blue at rest, over cyan to white when fast, (count, 3)."""
-    if velocities is None or not count:
-        return np.full((count, 3), (0.03, 0.22, 0.60), np.float32)
-    speed = np.linalg.norm(velocities, axis=1)
-    top = max(float(speed.max()) if top_speed is None else top_speed, 1e-6)
-    stops = np.array([[0.02, 0.10, 0.45], [0.03, 0.38, 0.75], [0.25, 0.80, 0.85], [1.0, 1.0, 1.0]])
-    at = np.clip(speed / top, 0.0, 1.0)
-    columns = [np.interp(at, np.linspace(0, 1, len(stops)), stops[:, c]) for c in range(3)]
-    return np.stack(columns, axis=1).astype(np.float32)
+def _particle_colours(frame):
+    """Linear RGB per particle: its speed's, or the liquid's where that is unknown, (N, 3)."""
+    if frame.velocities is None:
+        return np.tile(np.float32(linear(LIQUID[:3])), (len(frame.positions), 1))
+    speed = np.linalg.norm(frame.velocities, axis=1)
+    top = max(float(speed.max()) if frame.top_speed is None else frame.top_speed, 1e-6)
+    return linear(speed_colors(speed / top)).astype(np.float32)
 
 
 def _draw_opaque(frame, camera, size):
@@ -177,17 +171,14 @@ def _draw_opaque(frame, camera, size):
     for number, solid in enumerate(shown):
         points = solid.world_vertices()[solid.triangles]
         corners, normals = projected_corners(points, _corner_normals(points), camera, size)
-        colour = SOLID_COLOURS[number % len(SOLID_COLOURS)]
-        if solid.color is not None:
-            colour = tuple(c**2.2 for c in solid.color[:3])
-        colours = np.tile(np.float32(colour), (len(corners), 1))
+        colour = SOLIDS[number % len(SOLIDS)] if solid.color is None else solid.color[:3]
+        colours = np.tile(np.float32(linear(colour)), (len(corners), 1))
         draw_solids(corners, normals, colours, view, depth, picture)
     if frame.surface is None and len(frame.positions):
         image, z = camera.project(frame.positions, size)
         centres = np.concatenate([image, z[:, None]], axis=1).astype(np.float32)
-        colours = speed_colours(frame.velocities, len(centres), frame.top_speed)
-        focal = camera.intrinsics(size)[0]
-        draw_spheres(centres, 0.5 * frame.spacing, colours, view, focal, depth, picture)
+        focal, radius = camera.intrinsics(size)[0], 0.5 * frame.spacing
+        draw_spheres(centres, radius, _particle_colours(frame), view, focal, depth, picture)
     return depth, picture
 
 

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What colour things have wherever they are drawn: pictures, browser, markers. sRGB, 0 to 1."""
+
+import numpy as np
+
+from sph_ros.sim.shapes import Container
+
+#: Red, green, blue, alpha.
+LIQUID = (0.20, 0.45, 0.75, 0.8)
+CONTAINER = (0.70, 0.70, 0.70, 0.15)
+
+#: Of solids for which the scene gives none, in turn: red, green, blue.
+SOLIDS = ((0.90, 0.48, 0.32), (0.93, 0.76, 0.32), (0.48, 0.69, 0.38), (0.62, 0.46, 0.73))
+
+# Deep blue at rest, over light blue to white foam: share of the highest speed, red, green, blue.
+_SPEED_STOPS = np.array(
+    [
+        (0.00, 0.08, 0.24, 0.55),
+        (0.35, 0.16, 0.51, 0.84),
+        (0.70, 0.55, 0.80, 0.94),
+        (1.00, 0.98, 0.99, 1.00),
+    ]
+)
+
+
+def solid_colors(scene):
+    """Red, green, blue, alpha of every solid of a scene by name: the scene's, or one of ours."""
+    colors, chosen = {}, 0
+    for solid in scene.solids:
+        if isinstance(solid.shape, Container):
+            colors[solid.name] = CONTAINER
+        elif solid.color is not None:
+            colors[solid.name] = (*solid.color, 1.0)
+        else:
+            colors[solid.name] = (*SOLIDS[chosen % len(SOLIDS)], 1.0)
+            chosen += 1
+    return colors
+
+
+def speed_colors(shares):
+    """Red, green, blue (N, 3) of speeds as shares of the highest, (N,).
+
+    Values outside 0 to 1 are clipped, NaN is 0.
+    """
+    shares = np.clip(np.nan_to_num(np.asarray(shares, float), posinf=1.0, neginf=0.0), 0.0, 1.0)
+    at, stops = _SPEED_STOPS[:, 0], _SPEED_STOPS[:, 1:]
+    return np.stack([np.interp(shares, at, stops[:, c]) for c in range(3)], axis=1)
+
+
+def linear(rgb):
+    """Amounts of light of sRGB colours, with the usual power of 2.2."""
+    return np.asarray(rgb, float) ** 2.2

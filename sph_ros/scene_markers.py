@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulation as markers, the same on topics and in bags: the liquid's surface and the solids."""
+
+from msg_adapters.marker import triangle_marker
+from sph_ros.colors import LIQUID, solid_colors
+
+
+def surface_marker(vertices, triangles, stamp_ns, frame_id):
+    """The liquid's surface; a marker that deletes it where there are no triangles.
+
+    Args:
+        vertices: [m], (V, 3).
+        triangles: (T, 3).
+        stamp_ns: [ns].
+        frame_id: of the vertices.
+    """
+    return triangle_marker(
+        vertices, triangles, stamp_ns, frame_id, namespace="surface", color=LIQUID
+    )
+
+
+class SolidMarkers:
+    """Markers of a simulation's visible solids; triangles are looked up once, poses every time."""
+
+    def __init__(self, sim):
+        colors, frame = solid_colors(sim.scene), sim.scene.frame
+        self._drawn = []
+        for index, spec in enumerate(sim.scene.solids):
+            if spec.visible:
+                solid = sim.solid(spec.name)
+                marker = triangle_marker(
+                    *solid.mesh(),
+                    0,
+                    frame,
+                    namespace=spec.name,
+                    marker_id=index,
+                    color=colors[spec.name],
+                )
+                self._drawn.append((solid, marker))
+
+    def at(self, stamp_ns):
+        """The solids where they are now, with a stamp [ns]: a list of markers."""
+        return [_placed(solid, marker, stamp_ns) for solid, marker in self._drawn]
+
+
+def _placed(solid, marker, stamp_ns):
+    # Not dataclasses.replace: it takes longer than all the rest.
+    fields = {
+        **vars(marker),
+        "stamp_ns": stamp_ns,
+        "position": tuple(solid.position),
+        "quat_xyzw": tuple(solid.quat_xyzw),
+    }
+    return type(marker)(**fields)
