@@ -86,12 +86,16 @@ def to_world(rotation, origin, s, x, y, z):
 
 @inlined
 def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
-    """Write the contact of a point with solid s to `row` if it is near; whether it was."""
+    """Write the contact of a point with solid s to `row` if it is near.
+
+    Returns:
+        Whether it was, and a distance to the solid that is at most the true one [m].
+    """
     lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
     found = wall_terms(shapes, s, lx, ly, lz)
     fraction = found[4]
     if fraction <= np.float32(0.0):
-        return False
+        return False, found[0]
     solid[row] = s
     terms[row, FRACTION] = fraction
     terms[row, NEAR_FRACTION] = found[8]
@@ -105,7 +109,7 @@ def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
     terms[row, SURFACE_VELOCITY] = (x - ox) * inverse_step
     terms[row, SURFACE_VELOCITY + 1] = (y - oy) * inverse_step
     terms[row, SURFACE_VELOCITY + 2] = (z - oz) * inverse_step
-    return True
+    return True, found[0]
 
 
 @inlined
@@ -134,28 +138,37 @@ def combine_contacts(contacts, packing, i, begin, end):
 
 
 @device
-def find_contacts_of_chunk(chunk, positions, shapes, motion, inverse_step, packing, contacts):
-    """`find_contacts` for one chunk of particles; a function of its own compiles much faster."""
+def find_contacts_of_chunk(
+    chunk, positions, clearance, shapes, motion, inverse_step, packing, contacts
+):
+    """`find_contacts` for one chunk of particles; a function of its own compiles faster."""
     solids = motion.position.shape[0]
     cursor = chunk * CHUNK * solids
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         contacts.start[i] = cursor
-        for s in range(solids):
-            if add_contact(
-                shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
-            ):
-                cursor += 1
+        if clearance[i] < shapes.support_radius:
+            nearest = np.float32(np.inf)
+            for s in range(solids):
+                near, distance = add_contact(
+                    shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
+                )
+                nearest = min(nearest, distance)
+                if near:
+                    cursor += 1
+            clearance[i] = nearest
         contacts.end[i] = cursor
         combine_contacts(contacts, packing, i, contacts.start[i], cursor)
 
 
 @parallel_kernel
-def find_contacts(positions, shapes, motion, inverse_step, packing, chunks, contacts):
+def find_contacts(positions, clearance, shapes, motion, inverse_step, packing, chunks, contacts):
     """Contacts of all particles with the solids at the end of the substep.
 
     Args:
         positions: predicted, none inside a solid [m], (N, 3).
+        clearance: for each particle a distance that it certainly has from all solids [m], (N,);
+            where that is not enough to do without a look it is written anew.
         shapes: packed shapes of the S solids.
         motion: poses of the solids.
         inverse_step: 1 / substep [1/s], float32.
@@ -165,7 +178,9 @@ def find_contacts(positions, shapes, motion, inverse_step, packing, chunks, cont
         contacts: all written; needs room for chunks * CHUNK * S contacts.
     """
     for chunk in prange(chunks):
-        find_contacts_of_chunk(chunk, positions, shapes, motion, inverse_step, packing, contacts)
+        find_contacts_of_chunk(
+            chunk, positions, clearance, shapes, motion, inverse_step, packing, contacts
+        )
 
 
 @inlined
@@ -382,8 +397,8 @@ def keep_chunk_outside(
     starts,
     ends,
     origins,
-    contacts,
-    near_only,
+    clearance,
+    travel,
     shapes,
     motion,
     margin,
@@ -397,13 +412,18 @@ def keep_chunk_outside(
     slack = np.float32(0.5) * margin
     rescued = 0
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, starts.shape[0])):
-        moved = not near_only or contacts.start[i] < contacts.end[i]
+        dx, dy, dz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]
+        clearance[i] -= np.sqrt(dx * dx + dy * dy + dz * dz) + travel
+        if clearance[i] > np.float32(2.0) * margin:
+            continue
+        moved = True
         rounds = 0
         while moved and rounds < 8:
             moved = slide_past_solids(
                 i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
             )
             rounds += 1
+        clearance[i] = np.float32(0.0)
         x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
         if not moved or is_free(shapes, motion, x, y, z, slack):
             continue
@@ -420,8 +440,8 @@ def keep_outside(
     starts,
     ends,
     origins,
-    contacts,
-    near_only,
+    clearance,
+    travel,
     shapes,
     motion,
     margin,
@@ -441,8 +461,9 @@ def keep_outside(
     Args:
         starts: [m], (N, 3).
         ends: [m], (N, 3); changed where needed.
-        contacts, near_only: with the second, particles without a contact are taken to be too far
-            away.
+        clearance: for each particle a distance that it certainly has from all solids [m], (N,);
+            kept up to date.
+        travel: the farthest that a point of any solid moves in this substep [m], float32.
         origins: positions that the velocity will be reckoned from [m], (N, 3); moved along with
             particles that had to be rescued, so that a rescue is no kick.
         shapes, motion: the S solids.
@@ -459,8 +480,8 @@ def keep_outside(
             starts,
             ends,
             origins,
-            contacts,
-            near_only,
+            clearance,
+            travel,
             shapes,
             motion,
             margin,

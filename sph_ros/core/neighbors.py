@@ -18,6 +18,9 @@ from sph_ros.core.vector import LANES, append_within
 #: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
 CHUNK = 256
 
+#: Lists have a multiple of so many entries.
+LIST_STEP = 8
+
 
 class Grid(NamedTuple):
     """Cells over the particles.
@@ -38,14 +41,22 @@ class Grid(NamedTuple):
 class Pairs(NamedTuple):
     """Neighbours and pair geometry; the list of particle i is rows start[i]:end[i].
 
+    Lists are filled up to a multiple of `LIST_STEP` with the particle itself: its gradient with
+    itself is zero, so no sum over gradients notices, and vector loops leave no remainder. Kernels
+    take slices of the rows first, which tells the compiler that indices count from 0; only then it
+    makes vector code of the loop.
+
     Attributes:
         start, end: (N,) int64.
-        neighbors: rows of the neighbours, (M,) int32.
-        gradients: gradient at i of the normalised density weight [1/m] and 1 - r/h [-], (M, 4).
+        count: neighbours without the filling, (N,) int32.
+        neighbors: rows of the neighbours, (M,) uint32.
+        gradients: gradient at i of the normalised density weight, x, y, z [1/m], and 1 - r/h [-],
+            (4, M) float32.
     """
 
     start: np.ndarray
     end: np.ndarray
+    count: np.ndarray
     neighbors: np.ndarray
     gradients: np.ndarray
 
@@ -176,6 +187,18 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     return cursor
 
 
+@device
+def fill_list(i, neighbors, start, cursor):
+    """Fill the list that begins at `start` with i itself to a whole number of steps; the new end.
+
+    There is room: a search stops where fewer than `LANES` entries are left.
+    """
+    while (cursor - start) % LIST_STEP != 0:
+        neighbors[cursor] = i
+        cursor += 1
+    return cursor
+
+
 @parallel_kernel
 def find_neighbors(columns, grid, support_radius, chunks, pairs):
     """Neighbour lists of all particles.
@@ -188,7 +211,7 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
         grid: from `sort_by_cell`.
         support_radius: h [m], float32.
         chunks: `chunk_count(N)`.
-        pairs: `start`, `end` and `neighbors` are written.
+        pairs: all but the gradients is written.
 
     Returns:
         Number of chunks whose part was too small: enlarge the list and call again if it is not 0.
@@ -197,16 +220,19 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     room = pairs.neighbors.shape[0] // chunks
     square = support_radius * support_radius
     full = 0
-    starts, ends = pairs.start, pairs.end
+    starts, ends, counts = pairs.start, pairs.end, pairs.count
     for chunk in prange(chunks):
         cursor = np.intp(chunk * room)
         limit = cursor + room
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            starts[i] = cursor
+            start = cursor
             cursor = append_neighbors(i, columns, grid, square, pairs.neighbors, cursor, limit)
             if cursor < 0:
                 full += 1
                 break
+            starts[i] = start
+            counts[i] = cursor - start
+            cursor = fill_list(i, pairs.neighbors, start, cursor)
             ends[i] = cursor
     return full
 
@@ -227,7 +253,6 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
     inverse_h = one / support_radius
     slope = np.float32(-2.0) * density_scale * inverse_h
     xs, ys, zs = columns[0], columns[1], columns[2]
-    gradients = pairs.gradients
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
     for i in prange(pairs.start.shape[0]):
@@ -235,30 +260,46 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
         w, n = np.float32(0.0), np.float32(0.0)
         tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         square = np.float32(0.0)
-        for k in range(pairs.start[i], pairs.end[i]):
-            j = pairs.neighbors[k]
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+        # One loop for each array written: with more the compiler gives up proving that they do not
+        # overlap with those read, and makes no vector code.
+        for k in range(js.shape[0]):
+            j = js[k]
             dx = x - xs[j]
             dy = y - ys[j]
             dz = z - zs[j]
             # The tiny addend lets a particle be its own neighbour: 0 / tiny is 0.
-            r2 = dx * dx + dy * dy + dz * dz + np.float32(1e-20)
+            us[k] = dx * dx + dy * dy + dz * dz + np.float32(1e-20)
+        for k in range(js.shape[0]):
+            r2 = us[k]
             inverse_r = one / np.sqrt(r2)
             u = one - r2 * inverse_r * inverse_h
-            c = slope * u * inverse_r
-            gx, gy, gz = c * dx, c * dy, c * dz
-            gradients[k, 0] = gx
-            gradients[k, 1] = gy
-            gradients[k, 2] = gz
-            gradients[k, 3] = u
+            us[k] = u
+            gx[k] = slope * u * inverse_r
             w += u * u
             n += u * u * u
-            tx += gx
-            ty += gy
-            tz += gz
-            square += gx * gx + gy * gy + gz * gz
-        density[i] = density_scale * w + wall_density[i, 0]
-        near_density[i] = near_scale * n + wall_density[i, 1]
+            square += slope * slope * u * u
+        for k in range(js.shape[0]):
+            c = gx[k] * (y - ys[js[k]])
+            gy[k] = c
+            ty += c
+        for k in range(js.shape[0]):
+            c = gx[k] * (z - zs[js[k]])
+            gz[k] = c
+            tz += c
+        for k in range(js.shape[0]):
+            c = gx[k] * (x - xs[js[k]])
+            gx[k] = c
+            tx += c
+        # Each entry that only fills the list has counted as the particle itself, with weight 1.
+        filling = np.float32(end - start - pairs.count[i])
+        density[i] = density_scale * (w - filling) + wall_density[i, 0]
+        near_density[i] = near_scale * (n - filling) + wall_density[i, 1]
         gradient[i, 0] = tx
         gradient[i, 1] = ty
         gradient[i, 2] = tz
-        gradient_square[i] = square
+        # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
+        gradient_square[i] = square - slope * slope * (filling + one)

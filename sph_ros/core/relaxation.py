@@ -75,18 +75,23 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
     """
     cohesion, near = tension.cohesion, tension.near * tension.virial_ratio
     offset = cohesion + tension.near
+    density, near_density = sums.density, sums.near_density
     for i in prange(pairs.start.shape[0]):
         own = cohesion * sums.density[i] - offset
         own_near = near * sums.near_density[i]
         x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for k in range(pairs.start[i], pairs.end[i]):
-            j = pairs.neighbors[k]
-            both = own + cohesion * sums.density[j] - offset
-            both_near = own_near + near * sums.near_density[j]
-            c = both + weight_ratio * pairs.gradients[k, 3] * both_near
-            x += c * pairs.gradients[k, 0]
-            y += c * pairs.gradients[k, 1]
-            z += c * pairs.gradients[k, 2]
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+        for k in range(js.shape[0]):
+            j = js[k]
+            both = own + cohesion * density[j] - offset
+            both_near = own_near + near * near_density[j]
+            c = both + weight_ratio * us[k] * both_near
+            x += c * gx[k]
+            y += c * gy[k]
+            z += c * gz[k]
         wall = tension.adhesion * own
         wall_near = own_near
         g = contact_gradients
@@ -127,11 +132,15 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
     for i in prange(pressures.shape[0]):
         own = pressures[i]
         x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for k in range(pairs.start[i], pairs.end[i]):
-            both = own + pressures[pairs.neighbors[k]]
-            x += both * pairs.gradients[k, 0]
-            y += both * pairs.gradients[k, 1]
-            z += both * pairs.gradients[k, 2]
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz = pairs.gradients[2, start:end]
+        for k in range(js.shape[0]):
+            both = own + pressures[js[k]]
+            x += both * gx[k]
+            y += both * gy[k]
+            z += both * gz[k]
         displacements[i, 0] = cohesive[i, 0] - x - own * contact_gradients[i, 0]
         displacements[i, 1] = cohesive[i, 1] - y - own * contact_gradients[i, 1]
         displacements[i, 2] = cohesive[i, 2] - z - own * contact_gradients[i, 2]
@@ -178,12 +187,16 @@ def correct_pressures(
                 + contact_gradients[i, 1] * y
                 + contact_gradients[i, 2] * z
             )
-            for k in range(pairs.start[i], pairs.end[i]):
-                j = pairs.neighbors[k]
+            start, end = pairs.start[i], pairs.end[i]
+            js = pairs.neighbors[start:end]
+            gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+            gz = pairs.gradients[2, start:end]
+            for k in range(js.shape[0]):
+                j = js[k]
                 change += (
-                    pairs.gradients[k, 0] * (x - displacements[j, 0])
-                    + pairs.gradients[k, 1] * (y - displacements[j, 1])
-                    + pairs.gradients[k, 2] * (z - displacements[j, 2])
+                    gx[k] * (x - displacements[j, 0])
+                    + gy[k] * (y - displacements[j, 1])
+                    + gz[k] * (z - displacements[j, 2])
                 )
             pressure = guesses[i]
             residual = sums.density[i] - np.float32(1.0) + change - compliance * pressure
@@ -218,23 +231,26 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
     for i in prange(velocities.shape[0]):
         vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         ax, ay, az = zero, zero, zero
-        for k in range(pairs.start[i], pairs.end[i]):
-            j = pairs.neighbors[k]
-            gx, gy, gz = pairs.gradients[k, 0], pairs.gradients[k, 1], pairs.gradients[k, 2]
-            u = pairs.gradients[k, 3]
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+        for k in range(js.shape[0]):
+            j = js[k]
+            u = us[k]
             # Relative speed along the line from i to j, times slope u; positive: they approach.
             along = (
-                (vx - velocities[j, 0]) * gx
-                + (vy - velocities[j, 1]) * gy
-                + (vz - velocities[j, 2]) * gz
+                (vx - velocities[j, 0]) * gx[k]
+                + (vy - velocities[j, 1]) * gy[k]
+                + (vz - velocities[j, 2]) * gz[k]
             )
             inverse_u = np.float32(1.0) / (u + np.float32(1e-3))
             approach = max(along, zero) * inverse_u / slope
             share = min(linear * u + quadratic * u * approach, half)
             c = share * along * inverse_u * inverse_u * inverse_slope2
-            ax -= c * gx
-            ay -= c * gy
-            az -= c * gz
+            ax -= c * gx[k]
+            ay -= c * gy[k]
+            az -= c * gz[k]
         changed[i, 0] = vx + ax
         changed[i, 1] = vy + ay
         changed[i, 2] = vz + az
@@ -255,18 +271,21 @@ def viscous_operator(pairs, velocities, slope, linear, result):
     for i in prange(velocities.shape[0]):
         vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for k in range(pairs.start[i], pairs.end[i]):
-            j = pairs.neighbors[k]
-            gx, gy, gz = pairs.gradients[k, 0], pairs.gradients[k, 1], pairs.gradients[k, 2]
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+        for k in range(js.shape[0]):
+            j = js[k]
             along = (
-                (vx - velocities[j, 0]) * gx
-                + (vy - velocities[j, 1]) * gy
-                + (vz - velocities[j, 2]) * gz
+                (vx - velocities[j, 0]) * gx[k]
+                + (vy - velocities[j, 1]) * gy[k]
+                + (vz - velocities[j, 2]) * gz[k]
             )
-            c = scale * along / (pairs.gradients[k, 3] + np.float32(1e-3))
-            ax += c * gx
-            ay += c * gy
-            az += c * gz
+            c = scale * along / (us[k] + np.float32(1e-3))
+            ax += c * gx[k]
+            ay += c * gy[k]
+            az += c * gz[k]
         result[i, 0] = vx + ax
         result[i, 1] = vy + ay
         result[i, 2] = vz + az

@@ -92,7 +92,7 @@ class RelaxationSolver:
         self._predict(fluid, time_step)
         self._sort(fluid)
         self._clock("sort")
-        self._find_contacts(time_step)
+        self._find_contacts(time_step, self._work.clearance)
         self._clock("solids")
         self._find_neighbors()
         self._clock("neighbors")
@@ -115,7 +115,7 @@ class RelaxationSolver:
         search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
         search.gather_rows(work.order, fluid.positions, work.predicted)
         self._grid_now = grid
-        self._find_contacts(1.0)
+        self._find_contacts(1.0, np.zeros(len(fluid), np.float32))
         self._find_neighbors()
         self._sum_densities()
         density = np.empty(len(fluid), np.float32)
@@ -136,7 +136,7 @@ class RelaxationSolver:
         self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
         self._passed = now
 
-    def _keep_outside(self, starts, ends, origins, near_only, motion, time_step):
+    def _keep_outside(self, starts, ends, origins, travel, motion, time_step):
         work = self._work
         scene = self._scene
         if not len(self._solids):
@@ -146,8 +146,8 @@ class RelaxationSolver:
             starts,
             ends,
             origins,
-            work.contacts,
-            near_only,
+            work.clearance,
+            np.float32(travel),
             self._solids.packed,
             motion,
             np.float32(MARGIN * scene.spacing),
@@ -170,8 +170,10 @@ class RelaxationSolver:
             work.predicted,
         )
         work.starts[:] = fluid.positions
-        motion = self._solids.motion
-        self._keep_outside(fluid.positions, work.predicted, work.starts, False, motion, time_step)
+        travel = self._solids.travel
+        self._keep_outside(
+            fluid.positions, work.predicted, work.starts, travel, self._solids.motion, time_step
+        )
 
     def _grid(self):
         lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
@@ -190,12 +192,14 @@ class RelaxationSolver:
         work.predicted, work.scratch = work.scratch, work.predicted
         fluid.pressures = fluid.pressures[work.order]
         fluid.particle = fluid.particle[work.order]
+        work.clearance = work.clearance[work.order]
 
-    def _find_contacts(self, time_step):
+    def _find_contacts(self, time_step, clearance):
         work = self._work
         if len(self._solids):
             touch.find_contacts(
                 work.predicted,
+                clearance,
                 self._solids.packed,
                 self._solids.motion,
                 np.float32(1.0 / time_step),
@@ -272,9 +276,8 @@ class RelaxationSolver:
         still = self._solids.motion._replace(
             old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
         )
-        # From the predicted position, which is beside the solids as they are now. A displacement is
-        # not longer than the reach of a contact.
-        self._keep_outside(work.predicted, ends, fluid.positions, True, still, time_step)
+        # From the predicted position, which is beside the solids as they are now.
+        self._keep_outside(work.predicted, ends, fluid.positions, 0.0, still, time_step)
         relax.velocities_from_positions(
             fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors
         )

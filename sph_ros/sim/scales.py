@@ -32,8 +32,8 @@ import numpy as np
 
 from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, gradient_sum, lattice_sum
 
-#: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none, and its
-#: particles clump.
+#: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none,
+#: and its particles clump.
 NEAR_SHARE = 0.3
 
 #: Density of flowed liquid on the lattice's scale, where both have the same volume, over h /

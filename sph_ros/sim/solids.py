@@ -134,7 +134,11 @@ class Solid:
         )
 
     def advance(self, now, duration, max_speed):
-        """Move on for `duration` [s] from `now`, no point of it faster than `max_speed` [m/s]."""
+        """Move on for `duration` [s] from `now`, no point of it faster than `max_speed` [m/s].
+
+        Returns:
+            The farthest that a point of it moved [m].
+        """
         position, quat = self._wanted(now, now + duration)
         shift = position - self.position
         turn = quaternions.between(self.quat_xyzw, quat)
@@ -150,8 +154,9 @@ class Solid:
         end = now + duration
         while len(self._waypoints) > 1 and self._waypoints[0].time <= end:
             self._waypoints.popleft()
-        if self._waypoints and self._waypoints[0].time <= end and way * share >= way:
+        if self._waypoints and self._waypoints[0].time <= end and share == 1.0:
             self._waypoints.popleft()
+        return share * way
 
     def _wanted(self, now, time):
         """Pose at `time` on the straight way through the waypoints."""
@@ -177,6 +182,7 @@ class Solids:
     Attributes:
         packed: `PackedShapes`, for the kernels.
         motion: `Motion`, poses at the start and the end of the present substep.
+        travel: the farthest that a point of any solid moves in the present substep [m].
     """
 
     def __init__(self, scene):
@@ -239,6 +245,7 @@ class Solids:
 
     def settle(self):
         """Take the present poses as those at the start and at the end of a substep."""
+        self.travel = 0.0
         self._write_poses(self.motion.position, self.motion.rotation)
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
@@ -251,9 +258,10 @@ class Solids:
         """Move all solids on for `duration` [s]."""
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
+        self.travel = 0.0
         for solid in self:
             if solid.control != "fixed":
-                solid.advance(now, duration, max_speed)
+                self.travel = max(self.travel, solid.advance(now, duration, max_speed))
         self._write_poses(self.motion.position, self.motion.rotation)
 
     def _write_poses(self, position, rotation):

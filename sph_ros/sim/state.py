@@ -60,10 +60,12 @@ class Workspace:
 
     Attributes:
         chunks: pieces of parallel work.
-        predicted, sorted_rows, displacements, cohesive: (N, 3) float32.
+        predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
-        cell_of, order, sorted_particle: (N,) int32.
-        diagonal, sorted_pressures: (N,) float32.
+        cell_of, order: (N,) int32.
+        diagonal, scaled, guesses: of the pressure iterations, (N,) float32.
+        clearance: distance that a particle certainly has from all solids [m], (N,) float32; the
+            only thing here that a later step reads, and zeros would do.
         errors: (chunks,) float64; squeezed: (chunks,) int64.
         reactions: wrench per chunk and solid, (chunks, S, 6) float64.
         pairs, sums, contacts: see their classes.
@@ -83,6 +85,7 @@ class Workspace:
         self.cell_of = np.empty(count, np.int32)
         self.order = np.empty(count, np.int32)
         self.diagonal = np.empty(count, np.float32)
+        self.clearance = np.zeros(count, np.float32)
         self.scaled = np.empty(count, np.float32)
         self.guesses = np.empty(count, np.float32)
         self.errors = np.zeros(self.chunks, np.float64)
@@ -111,8 +114,9 @@ class Workspace:
         self.pairs = Pairs(
             np.zeros(self.count, np.int64),
             np.zeros(self.count, np.int64),
-            np.empty(room, np.int32),
-            np.empty((room, 4), np.float32),
+            np.zeros(self.count, np.int32),
+            np.empty(room, np.uint32),
+            np.empty((4, room), np.float32),
         )
 
     def enlarge_pairs(self):
