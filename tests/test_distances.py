@@ -11,7 +11,7 @@ from sph_ros.core.distances import (
     signed_distance,
     signed_distances,
 )
-from sph_ros.sim.packing import rotation_matrix
+from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shapes import (
     Box,
     Capsule,
@@ -64,9 +64,7 @@ def naive_distance(shape, points):
     if isinstance(shape, Container):
         return -naive_distance(shape.shape, points)
     parts = [
-        naive_distance(
-            part.shape, (points - part.pose.position) @ rotation_matrix(part.pose.quat_xyzw)
-        )
+        naive_distance(part.shape, (points - part.pose.position) @ to_matrix(part.pose.quat_xyzw))
         for part in shape.of
     ]
     if isinstance(shape, Union):
@@ -226,7 +224,7 @@ def test_two_dimensions_ignore_y():
     )
     box = Box(size=(0.04, 0.02, 0.06))
     endless = Box(size=(0.04, 50.0, 0.06))
-    turned = flat @ rotation_matrix(Pose(quat_xyzw=about_y).quat_xyzw)
+    turned = flat @ to_matrix(Pose(quat_xyzw=about_y).quat_xyzw)
     expected = naive_distance(endless, turned)
     np.testing.assert_allclose(distance(box, Pose((0, 1, 0), about_y)), expected, atol=1e-7)
     np.testing.assert_allclose(

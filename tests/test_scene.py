@@ -70,7 +70,7 @@ EXPECTED_PARTICLES = {
     "ball_tank_large": (19_000, 21_000),
     "dam_break": (5120, 5120),
     "dam_break_2d": (3200, 3200),
-    "drop_box": (4000, 4400),
+    "drop_box": (2100, 2300),
     "resting_column": (2000, 2000),
 }
 

@@ -21,6 +21,7 @@ from sph_ros.render.raster import (
 )
 from sph_ros.render.walls import surface_at_walls
 from sph_ros.render.water import compose
+from sph_ros.sim.quaternions import normalized, to_matrix
 
 #: Edges between faces that differ by more than this angle are outlines and keep flat shading [deg].
 CREASE_ANGLE = 35.0
@@ -52,10 +53,8 @@ class SolidView:
 
     def world_vertices(self) -> np.ndarray:
         """Vertices in the world [m], (V, 3) float64."""
-        x, y, z, w = np.asarray(self.quat_xyzw, np.float64) / np.linalg.norm(self.quat_xyzw)
-        axis, points = np.array([x, y, z]), np.asarray(self.vertices, np.float64)
-        turned = np.cross(axis, points)
-        return points + 2.0 * (w * turned + np.cross(axis, turned)) + np.asarray(self.position)
+        rotation = to_matrix(normalized(self.quat_xyzw))
+        return np.asarray(self.vertices, np.float64) @ rotation.T + np.asarray(self.position)
 
 
 @dataclass(frozen=True)

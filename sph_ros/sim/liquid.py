@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sph_ros.core.distances import signed_distances
-from sph_ros.sim.packing import rotation_matrix
+from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shapes import Box, Capsule, Cylinder, Pose, Sphere, pack_shapes
 
 #: Memory that a particle takes in all arrays of a simulation together, rounded up [bytes].
@@ -59,9 +59,7 @@ def distances_to(shape, pose, points, scene):
         (N,) float32.
     """
     packed = pack_shapes([shape], scene.support_radius, scene.spacing, scene.dimension)
-    local = np.ascontiguousarray(
-        (points - pose.position) @ rotation_matrix(pose.quat_xyzw), np.float32
-    )
+    local = np.ascontiguousarray((points - pose.position) @ to_matrix(pose.quat_xyzw), np.float32)
     distance = np.empty(len(local), np.float32)
     signed_distances(packed, 0, local, distance)
     return distance
@@ -135,4 +133,4 @@ def _is_new(points, earlier, scene, index):
 
 
 def _to_scene(points, pose):
-    return points @ rotation_matrix(pose.quat_xyzw).T + pose.position
+    return points @ to_matrix(pose.quat_xyzw).T + pose.position

@@ -2,19 +2,9 @@
 """Liquids in SI units, and the packaged ones by name."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
-#: Field -> (lowest, highest) accepted value; also the ranges of the ROS parameters.
-RANGES = {
-    "density": (1.0, 50_000.0),
-    "viscosity": (0.0, 1_000.0),
-    "surface_tension": (0.0, 10.0),
-    "compression": (0.0005, 0.2),
-    "wall_friction": (0.0, 1.0),
-    "adhesion": (0.0, 1.0),
-    "quadratic_viscosity": (0.0, 10.0),
-}
+from sph_ros.sim.quantities import check_quantities, limits_of, quantity
 
 
 @dataclass(frozen=True)
@@ -34,23 +24,21 @@ class Material:
     """
 
     name: str = "water"
-    density: float = 1000.0
-    viscosity: float = 0.001
-    surface_tension: float = 0.072
-    compression: float = 0.01
-    wall_friction: float = 0.1
-    adhesion: float = 0.5
-    quadratic_viscosity: float = 0.3
+    density: float = quantity("kg/m^3", 1000.0, low=1.0, high=50_000.0)
+    viscosity: float = quantity("Pa s", 0.001, low=0.0, high=1_000.0)
+    surface_tension: float = quantity("N/m", 0.072, low=0.0, high=10.0)
+    compression: float = quantity("1", 0.01, low=0.0005, high=0.2)
+    wall_friction: float = quantity("1", 0.1, low=0.0, high=1.0)
+    adhesion: float = quantity("1", 0.5, low=0.0, high=1.0)
+    quadratic_viscosity: float = quantity("1", 0.3, low=0.0, high=10.0)
 
     def __post_init__(self):
         """Refuse what is no number or out of range."""
-        for field, (low, high) in RANGES.items():
-            value = getattr(self, field)
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{field}: expected a number, got {value!r}")
-            if not (math.isfinite(value) and low <= value <= high):
-                raise ValueError(f"{field}: expected {low:g} to {high:g}, got {value!r}")
+        check_quantities(self)
 
+
+#: Field -> (lowest, highest) accepted value; also the ranges of the ROS parameters.
+RANGES = limits_of(Material)
 
 MATERIALS = {
     material.name: material

@@ -10,6 +10,7 @@ import numpy as np
 from sph_ros.core import distances as core
 from sph_ros.core.wall_tables import TABLE_STEPS, WallTables
 from sph_ros.sim.meshes import DistanceGrid, load_distance_grid
+from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shape_types import (
     Box,
     Capsule,
@@ -31,18 +32,6 @@ _UNBOUNDED = 1e30
 _PARALLEL = 1.0 - 1e-6
 
 
-def rotation_matrix(quat_xyzw) -> np.ndarray:
-    """Rotation matrix of a unit quaternion, (3, 3)."""
-    x, y, z, w = quat_xyzw
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 @dataclass(frozen=True)
 class _Frame:
     """solid_point = rotation @ point + position."""
@@ -51,7 +40,7 @@ class _Frame:
     position: np.ndarray
 
     def child(self, pose: Pose) -> "_Frame":
-        rotation = self.rotation @ rotation_matrix(pose.quat_xyzw)
+        rotation = self.rotation @ to_matrix(pose.quat_xyzw)
         return _Frame(rotation, self.rotation @ np.array(pose.position) + self.position)
 
     def moved(self, offset) -> "_Frame":

@@ -50,9 +50,6 @@ __all__ = [
     "scene_path",
 ]
 
-_MATERIAL_UNITS = "SI units"
-
-
 # ---------------------------------------------------------------- finding
 
 
@@ -174,7 +171,6 @@ def _read_material(node: Node) -> Material:
         Material,
         Node(children, node.key, node.where),
         {"name": Node.text},
-        unit=_MATERIAL_UNITS,
         extra=extra,
     )
 
@@ -186,7 +182,7 @@ def _material(node: Node, name: str) -> Material:
 
 
 def _read_pose(node: Node) -> Pose:
-    return build(Pose, node, unit="m")
+    return build(Pose, node)
 
 
 def _read_emitter(node: Node) -> Emitter:
@@ -204,7 +200,7 @@ def _read_solid(node: Node, folder: Path) -> SolidSpec:
     shape = _read_shape(node, SHAPE_KEYS, folder)
     readers = {
         "pose": _read_pose,
-        "path": lambda path: tuple(build(Keyframe, item, unit="m") for item in path.items()),
+        "path": lambda path: tuple(build(Keyframe, item) for item in path.items()),
     }
     return build(SolidSpec, _without(node, SHAPE_KEYS), readers, extra={"shape": shape})
 
@@ -227,7 +223,7 @@ def _read_shape(node: Node, kinds, folder):
 
 
 def _primitive(cls):
-    return lambda node, folder: build(cls, node, unit="m")
+    return lambda node, folder: build(cls, node)
 
 
 def _read_mesh(node: Node, folder: Path) -> Mesh:
@@ -236,7 +232,7 @@ def _read_mesh(node: Node, folder: Path) -> Mesh:
         path = folder / file.text()
         if not path.is_file():
             raise file.error(f"no such mesh file: {path}")
-    return build(Mesh, node, {"file": lambda child: str(folder / child.text())}, unit="m")
+    return build(Mesh, node, {"file": lambda child: str(folder / child.text())})
 
 
 def _read_container(node: Node, folder: Path) -> Container:

@@ -4,15 +4,20 @@
 SI units, z up. Every one checks its own values and raises ValueError("field: what is wrong").
 """
 
-import dataclasses
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from sph_ros.sim.materials import Material
+from sph_ros.sim.quantities import (
+    Quaternion,
+    Vector,
+    check_quantities,
+    quantity,
+    replace_fields,
+    unit_vector,
+)
 from sph_ros.sim.shapes import Box, Capsule, Cylinder, Pose, Shape, Sphere
-
-Vector = tuple[float, float, float]
 
 #: Solvers that exist, and those that are announced but cannot be chosen yet.
 SOLVERS = ("relaxation",)
@@ -28,55 +33,6 @@ PLANNED_CONTROLS = ("free",)
 LIQUID_SHAPES = (Box, Sphere, Cylinder, Capsule)
 
 _TOPIC_TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-
-
-def quantity(unit, default=dataclasses.MISSING, *, low=-math.inf, high=math.inf, above=None):
-    """A field that holds a number, or a vector as long as its default or as `Vector`.
-
-    Args:
-        unit: of the number, for messages; "1" if it has none.
-        default: None makes the field optional.
-        low: lowest accepted value.
-        high: highest accepted value.
-        above: lower bound that is not itself accepted.
-    """
-    limits = {"unit": unit, "low": low, "high": high, "above": above}
-    return field(default=default, metadata=limits)
-
-
-def _check_quantities(instance):
-    """Turn every quantity into float or a tuple of floats, or refuse it."""
-    for item in dataclasses.fields(instance):
-        value = getattr(instance, item.name)
-        if "unit" not in item.metadata or (value is None and item.default is None):
-            continue
-        if item.type in (Vector, Vector | None):
-            value = _vector(item, value)
-        else:
-            value = _number(item.name, value, item.metadata)
-        object.__setattr__(instance, item.name, value)
-
-
-def _vector(item, value):
-    if isinstance(value, (str, dict)) or not hasattr(value, "__len__") or len(value) != 3:
-        raise ValueError(f"{item.name}: expected 3 numbers (x, y, z), got {value!r}")
-    return tuple(_number(f"{item.name}[{i}]", v, item.metadata) for i, v in enumerate(value))
-
-
-def _number(name, value, limits):
-    unit = "" if limits["unit"] == "1" else f" [{limits['unit']}]"
-    if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
-        raise ValueError(f"{name}: expected a number{unit}, got {value!r}")
-    number = float(value)
-    if math.isnan(number) or (math.isinf(number) and not math.isinf(limits["high"])):
-        raise ValueError(f"{name}: expected a finite number{unit}, got {value!r}")
-    if limits["above"] is not None and not number > limits["above"]:
-        raise ValueError(f"{name}: expected more than {limits['above']:g}{unit}, got {number:g}")
-    if not limits["low"] <= number <= limits["high"]:
-        low, high = limits["low"], limits["high"]
-        wanted = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
-        raise ValueError(f"{name}: expected {wanted}{unit}, got {number:g}")
-    return number
 
 
 @dataclass(frozen=True)
@@ -98,7 +54,7 @@ class LiquidBlock:
         if not isinstance(self.shape, LIQUID_SHAPES):
             known = ", ".join(shape.__name__.lower() for shape in LIQUID_SHAPES)
             raise ValueError(f"shape: liquid can be a {known}; got {self.shape!r}")
-        _check_quantities(self)
+        check_quantities(self)
 
 
 @dataclass(frozen=True)
@@ -127,11 +83,8 @@ class Emitter:
 
     def __post_init__(self):
         """Refuse a jet without direction or strength, and one that never runs."""
-        _check_quantities(self)
-        norm = math.sqrt(sum(v * v for v in self.direction))
-        if norm < 1e-9:
-            raise ValueError(f"direction: expected a length above 0, got {list(self.direction)}")
-        object.__setattr__(self, "direction", tuple(v / norm for v in self.direction))
+        check_quantities(self)
+        replace_fields(self, direction=unit_vector("direction", self.direction))
         if self.speed is None and self.rate is None:
             raise ValueError("speed: expected a speed [m/s] or a rate [particles/s], got neither")
         if self.until <= self.from_time:
@@ -139,7 +92,7 @@ class Emitter:
                 f"until: expected more than from ({self.from_time:g} s), got {self.until:g}"
             )
         if self.limit is not None:
-            object.__setattr__(self, "limit", int(self.limit))
+            replace_fields(self, limit=int(self.limit))
 
 
 @dataclass(frozen=True)
@@ -154,13 +107,12 @@ class Keyframe:
 
     time: float = quantity("s", low=0.0, high=1e9)
     position: Vector = quantity("m", low=-1e4, high=1e4)
-    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    quat_xyzw: Quaternion = quantity("1", (0.0, 0.0, 0.0, 1.0))
 
     def __post_init__(self):
-        """Check the numbers; Pose knows what a quaternion is."""
-        _check_quantities(self)
-        pose = Pose(self.position, self.quat_xyzw)
-        object.__setattr__(self, "quat_xyzw", pose.quat_xyzw)
+        """Refuse what is no pose."""
+        check_quantities(self)
+        replace_fields(self, quat_xyzw=unit_vector("quat_xyzw", self.quat_xyzw))
 
 
 @dataclass(frozen=True)
@@ -200,7 +152,7 @@ class SolidSpec:
             raise ValueError(f"control: expected one of {CONTROLS}, got {self.control!r}")
         if not isinstance(self.visible, bool):
             raise ValueError(f"visible: expected true or false, got {self.visible!r}")
-        _check_quantities(self)
+        check_quantities(self)
         self._check_path()
 
     def _check_path(self):
@@ -256,10 +208,10 @@ class Scene:
 
     def __post_init__(self):
         """Refuse what does not fit together."""
-        _check_quantities(self)
+        check_quantities(self)
         self._check_words()
         if self.support_radius is None:
-            object.__setattr__(self, "support_radius", 2.0 * self.spacing)
+            replace_fields(self, support_radius=2.0 * self.spacing)
         low, high = 1.2 * self.spacing, 4.0 * self.spacing
         if not low <= self.support_radius <= high:
             raise ValueError(

@@ -199,7 +199,6 @@ def build(
     cls,
     node: Node,
     readers: Mapping[str, Callable[[Node], object]] | None = None,
-    unit: str = "",
     renamed: Mapping[str, str] | None = None,
     extra: Mapping[str, object] | None = None,
 ):
@@ -209,7 +208,6 @@ def build(
         cls: the dataclass; it raises ValueError("field: what is wrong").
         node: the mapping.
         readers: for fields that are more than numbers and text; gets the field's Node.
-        unit: of fields that state none themselves in their metadata; for messages.
         renamed: field -> key, where they differ.
         extra: values of fields that have no key in the file.
 
@@ -226,8 +224,8 @@ def build(
     for key, field in fields.items():
         if key in children:
             read = readers.get(field.name, Node.plain)
-            if read is Node.plain and field.metadata.get("unit", unit):
-                _refuse_text(children[key], field.metadata.get("unit", unit))
+            if read is Node.plain and "unit" in field.metadata:
+                _refuse_text(children[key], field.metadata["unit"])
             values[field.name] = read(children[key])
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             raise node.error(f"missing key {key!r}")
@@ -245,7 +243,8 @@ def _refuse_text(node: Node, unit: str) -> None:
         for child in node.value:
             _refuse_text(child, unit)
     elif isinstance(node.value, str) and node.value != "auto":
-        raise node.error(f"expected a number in {unit}, without the unit; got {node.value!r}")
+        wanted = "a plain number" if unit == "1" else f"a number in {unit}, without the unit"
+        raise node.error(f"expected {wanted}; got {node.value!r}")
 
 
 def _located(error: ValueError, node: Node, fields, renamed) -> SceneError:

@@ -8,7 +8,8 @@ import numpy as np
 
 from sph_ros.core.distances import signed_distances
 from sph_ros.sim.meshes import load_surface
-from sph_ros.sim.packing import pack_shapes, rotation_matrix
+from sph_ros.sim.packing import pack_shapes
+from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shape_types import (
     Box,
     Capsule,
@@ -92,7 +93,7 @@ def _placed_extent(part: Placed) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(upper - lower).all():
         return np.full(3, -math.inf), np.full(3, math.inf)
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
-    corners = corners @ rotation_matrix(part.pose.quat_xyzw).T + part.pose.position
+    corners = corners @ to_matrix(part.pose.quat_xyzw).T + part.pose.position
     return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -191,7 +192,7 @@ def _square(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
 
 def _placed_surface(part: Placed) -> tuple[np.ndarray, np.ndarray]:
     vertices, triangles = display_mesh(part.shape)
-    return vertices @ rotation_matrix(part.pose.quat_xyzw).T + part.pose.position, triangles
+    return vertices @ to_matrix(part.pose.quat_xyzw).T + part.pose.position, triangles
 
 
 def _concatenated(surfaces) -> tuple[np.ndarray, np.ndarray]:

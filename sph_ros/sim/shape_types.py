@@ -5,59 +5,16 @@ Every shape checks itself on construction and raises ValueError naming the field
 was expected, so that code further in need not ask again.
 """
 
-import math
 from dataclasses import dataclass
 
-Vector = tuple[float, float, float]
-
-
-def _number(name: str, value) -> float:
-    if isinstance(value, (bool, str)):
-        raise ValueError(f"{name}: expected a number, got {value!r}")
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected a number, got {value!r}") from None
-    if not math.isfinite(number):
-        raise ValueError(f"{name}: expected a finite number, got {value!r}")
-    return number
-
-
-def _positive(name: str, value) -> float:
-    number = _number(name, value)
-    if number <= 0.0:
-        raise ValueError(f"{name}: expected a number greater than 0, got {value!r}")
-    return number
-
-
-def _not_negative(name: str, value) -> float:
-    number = _number(name, value)
-    if number < 0.0:
-        raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
-    return number
-
-
-def _vector(name: str, value, length: int = 3) -> tuple[float, ...]:
-    try:
-        items = None if isinstance(value, str) else tuple(value)
-    except TypeError:
-        items = None
-    if items is None or len(items) != length:
-        raise ValueError(f"{name}: expected {length} numbers, got {value!r}")
-    return tuple(_number(f"{name}[{index}]", item) for index, item in enumerate(items))
-
-
-def _unit(name: str, value: tuple[float, ...]) -> tuple[float, ...]:
-    norm = math.sqrt(math.fsum(item * item for item in value))
-    if norm < 1e-9:
-        raise ValueError(f"{name}: expected a length greater than 0, got {value!r}")
-    return tuple(item / norm for item in value)
-
-
-def _set(instance, **fields) -> None:
-    """Store normalised values; frozen dataclasses allow it only this way, and only here."""
-    for name, value in fields.items():
-        object.__setattr__(instance, name, value)
+from sph_ros.sim.quantities import (
+    Quaternion,
+    Vector,
+    check_quantities,
+    quantity,
+    replace_fields,
+    unit_vector,
+)
 
 
 @dataclass(frozen=True)
@@ -69,26 +26,22 @@ class Pose:
         quat_xyzw: orientation, normalised on construction; a zero quaternion is refused.
     """
 
-    position: Vector = (0.0, 0.0, 0.0)
-    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    position: Vector = quantity("m", (0.0, 0.0, 0.0))
+    quat_xyzw: Quaternion = quantity("1", (0.0, 0.0, 0.0, 1.0))
 
     def __post_init__(self):
-        quat_xyzw = _vector("quat_xyzw", self.quat_xyzw, 4)
-        _set(
-            self,
-            position=_vector("position", self.position),
-            quat_xyzw=_unit("quat_xyzw", quat_xyzw),
-        )
+        check_quantities(self)
+        replace_fields(self, quat_xyzw=unit_vector("quat_xyzw", self.quat_xyzw))
 
 
 @dataclass(frozen=True)
 class Sphere:
     """A ball about the origin; a disc in 2D. Radius [m]."""
 
-    radius: float
+    radius: float = quantity("m", above=0.0)
 
     def __post_init__(self):
-        _set(self, radius=_positive("radius", self.radius))
+        check_quantities(self)
 
 
 @dataclass(frozen=True)
@@ -98,35 +51,34 @@ class Box:
     After construction all three fields hold.
     """
 
-    min: Vector | None = None
-    max: Vector | None = None
-    size: Vector | None = None
+    min: Vector | None = quantity("m", None)
+    max: Vector | None = quantity("m", None)
+    size: Vector | None = quantity("m", None, above=0.0)
 
     def __post_init__(self):
+        check_quantities(self)
         lower, upper = self._corners()
         for axis, name in enumerate("xyz"):
             if not lower[axis] < upper[axis]:
                 raise ValueError(
                     f"box: expected min < max along {name}, got {lower[axis]} and {upper[axis]}"
                 )
-        size = tuple(b - a for a, b in zip(lower, upper, strict=True))
-        _set(self, min=lower, max=upper, size=size)
+        replace_fields(self, min=lower, max=upper, size=_difference(upper, lower))
 
-    def _corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        corners_given = self.min is not None and self.max is not None
-        if corners_given:
-            lower, upper = _vector("min", self.min), _vector("max", self.max)
-            if self.size is None or _vector("size", self.size) == tuple(
-                b - a for a, b in zip(lower, upper, strict=True)
-            ):
-                return lower, upper
+    def _corners(self) -> tuple[Vector, Vector]:
+        if self.min is not None and self.max is not None:
+            if self.size is None or self.size == _difference(self.max, self.min):
+                return self.min, self.max
         if self.size is None or self.min is not None or self.max is not None:
             raise ValueError(
                 "box: expected either min and max or size alone, "
                 f"got min={self.min!r}, max={self.max!r}, size={self.size!r}"
             )
-        size = tuple(_positive(f"size[{i}]", v) for i, v in enumerate(_vector("size", self.size)))
-        return tuple(-0.5 * v for v in size), tuple(0.5 * v for v in size)
+        return tuple(-0.5 * v for v in self.size), tuple(0.5 * v for v in self.size)
+
+
+def _difference(a: Vector, b: Vector) -> Vector:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
 @dataclass(frozen=True)
@@ -138,30 +90,22 @@ class Capsule:
         length: between the centres of the two ends [m]; 0 makes a ball.
     """
 
-    radius: float
-    length: float
+    radius: float = quantity("m", above=0.0)
+    length: float = quantity("m", low=0.0)
 
     def __post_init__(self):
-        _set(
-            self,
-            radius=_positive("radius", self.radius),
-            length=_not_negative("length", self.length),
-        )
+        check_quantities(self)
 
 
 @dataclass(frozen=True)
 class Cylinder:
     """A cylinder with flat ends about the z axis, centred on the origin; radius and length [m]."""
 
-    radius: float
-    length: float
+    radius: float = quantity("m", above=0.0)
+    length: float = quantity("m", above=0.0)
 
     def __post_init__(self):
-        _set(
-            self,
-            radius=_positive("radius", self.radius),
-            length=_positive("length", self.length),
-        )
+        check_quantities(self)
 
 
 @dataclass(frozen=True)
@@ -173,12 +117,12 @@ class Plane:
         offset: signed distance of the plane from the origin along the normal [m].
     """
 
-    normal: Vector = (0.0, 0.0, 1.0)
-    offset: float = 0.0
+    normal: Vector = quantity("1", (0.0, 0.0, 1.0))
+    offset: float = quantity("m", 0.0)
 
     def __post_init__(self):
-        normal = _unit("normal", _vector("normal", self.normal))
-        _set(self, normal=normal, offset=_number("offset", self.offset))
+        check_quantities(self)
+        replace_fields(self, normal=unit_vector("normal", self.normal))
 
 
 @dataclass(frozen=True)
@@ -191,12 +135,13 @@ class Mesh:
     """
 
     file: str
-    scale: float = 1.0
+    scale: float = quantity("m per unit of the file", 1.0, above=0.0)
 
     def __post_init__(self):
+        check_quantities(self)
         if not str(self.file).strip():
             raise ValueError(f"file: expected the path of a mesh, got {self.file!r}")
-        _set(self, file=str(self.file), scale=_positive("scale", self.scale))
+        replace_fields(self, file=str(self.file))
 
 
 @dataclass(frozen=True)
@@ -229,7 +174,7 @@ class Union:
     of: tuple[Placed, ...]
 
     def __post_init__(self):
-        _set(self, of=_parts("union", self.of, 1))
+        replace_fields(self, of=_parts("union", self.of, 1))
 
 
 @dataclass(frozen=True)
@@ -239,7 +184,7 @@ class Difference:
     of: tuple[Placed, ...]
 
     def __post_init__(self):
-        _set(self, of=_parts("difference", self.of, 2))
+        replace_fields(self, of=_parts("difference", self.of, 2))
 
 
 @dataclass(frozen=True)
