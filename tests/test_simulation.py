@@ -148,6 +148,15 @@ def test_reset_starts_over_to_the_bit(sim):
     assert state(sim) == first
 
 
+def test_asking_changes_nothing(sim):
+    twin = sph_ros.Simulation(SCENE)
+    for _ in range(5):
+        assert sim.densities.max() > 0 and sim.statistics() and len(sim.surface())
+        sim.step()
+        twin.step()
+    assert state(sim) == state(twin)
+
+
 def test_a_snapshot_goes_on_to_the_bit(sim, tmp_path):
     stir(sim, 25)
     sim.set_material(viscosity=0.5)

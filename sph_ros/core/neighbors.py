@@ -303,3 +303,33 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
         gradient[i, 2] = tz
         # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
         gradient_square[i] = square - slope * slope * (filling + one)
+
+
+@parallel_kernel
+def densities_of_pairs(positions, support_radius, density_scale, wall_density, pairs, density):
+    """Densities of particles that have moved a little since their lists were made.
+
+    Args:
+        positions: [m], (N, 3).
+        support_radius: h [m], float32.
+        density_scale: 1 / lattice sum of the weight [-], float32.
+        wall_density: density that walls add in its first column [-], (N, 2).
+        pairs: from `find_neighbors`.
+        density: relative to rest [-], (N,); written.
+    """
+    inverse_h = np.float32(1.0) / support_radius
+    for i in prange(density.shape[0]):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        w = np.float32(0.0)
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        for k in range(js.shape[0]):
+            j = js[k]
+            dx = x - positions[j, 0]
+            dy = y - positions[j, 1]
+            dz = z - positions[j, 2]
+            u = np.float32(1.0) - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
+            u = u if u > np.float32(0.0) else np.float32(0.0)
+            w += u * u
+        filling = np.float32(end - start - pairs.count[i])
+        density[i] = density_scale * (w - filling) + wall_density[i, 0]

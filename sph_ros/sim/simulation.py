@@ -123,7 +123,8 @@ class Simulation:
             "solver": self._solver.state(),
             "solids": {solid.name: solid.state() for solid in self._solids},
         }
-        write_snapshot(path, self.scene, self.material, self._fluid.arrays(), numbers)
+        arrays = {**self._fluid.arrays(), "densities": self._relative_densities()}
+        write_snapshot(path, self.scene, self.material, arrays, numbers)
 
     @classmethod
     def load(cls, path):
@@ -135,6 +136,7 @@ class Simulation:
         scene, material, arrays, numbers = read_snapshot(path)
         simulation = cls(scene)
         simulation._fluid = Fluid.of_arrays(arrays)
+        simulation._densities = arrays["densities"]
         simulation.material = material
         simulation._solver.set_material(material)
         simulation._solver.set_state(numbers["solver"])

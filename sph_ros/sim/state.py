@@ -48,6 +48,10 @@ class Fluid:
         fluid.particle = arrays["particle"]
         return fluid
 
+    def copy(self):
+        """A liquid of its own in the same state."""
+        return self.of_arrays({name: rows.copy() for name, rows in self.arrays().items()})
+
     def public(self, rows):
         """Copy of an array with a row per particle, in public order."""
         result = np.empty_like(rows)
