@@ -39,8 +39,13 @@ def _user_errors():
     from msg_adapters.bags import BagError
     from sph_ros.sim.scene_yaml import SceneError
     from sph_ros.simulate import SimulateError
+    from sph_ros.tracking.calibration import CalibrationError
+    from sph_ros.tracking.commands import CommandError
+    from sph_ros.tracking.detection import DictionaryError
+    from sph_ros.tracking.targets import TargetError
 
-    return SceneError, BagError, SimulateError
+    tracking = CalibrationError, CommandError, DictionaryError, TargetError
+    return SceneError, BagError, SimulateError, *tracking
 
 
 def _parser():
@@ -61,6 +66,7 @@ def _parser():
         "demo", help="the node, a recorded hand and a live view at once", add_help=False
     )
     _add_simulate(commands)
+    _add_tracking(commands)
     return parser
 
 
@@ -91,6 +97,13 @@ def _add_simulate(commands):
     add("--no-video", dest="video", action="store_false", help="no video.mp4, no last.png")
     add("--size", type=_size, default=(960, 720), metavar="WxH", help="of the video [pixels]")
     simulate.set_defaults(run=_simulate)
+
+
+def _add_tracking(commands):
+    from sph_ros.tracking.commands import add_calibrate, add_markers
+
+    add_markers(commands)
+    add_calibrate(commands)
 
 
 # ---------------------------------------------------------------- options

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sph_ros.tracking.edges import edge_corners
+
 #: A sub-pixel window reaches so far [modules of the marker] to each side of a corner, so that it
 #: sees the border's corner and nothing of the pattern inside.
 REFINE_MODULES = 0.6
@@ -110,18 +112,26 @@ class Detector:
         return found
 
     def _refined(self, gray, corners):
-        """Corners to a fraction of a pixel; those of an edge-on marker stay as they are."""
+        """Corners to a fraction of a pixel; where that fails they stay as they are."""
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
-        module = float(sides.min()) / self._modules
-        window = int(min(MAX_REFINE_WINDOW, REFINE_MODULES * module))
-        if window < 1:
-            return corners
-        start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
-        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-        better = cv2.cornerSubPix(gray, start.copy(), (window, window), (-1, -1), criteria)[:, 0]
-        shift = np.linalg.norm(better - corners, axis=1)
-        good = shift <= max(1.5, MAX_REFINE_SHIFT * module)
-        return np.where(good[:, None], better, corners)
+        allowed = max(2.0, MAX_REFINE_SHIFT * float(sides.mean()) / self._modules)
+        better = edge_corners(gray, corners, self._modules)
+        if better is not None and float(np.abs(better - corners).max()) <= allowed:
+            return better
+        return _corner_sub_pixel(gray, corners, float(sides.min()) / self._modules)
+
+
+def _corner_sub_pixel(gray, corners, module):
+    """OpenCV's refinement, for markers too small for lines through their sides."""
+    window = int(min(MAX_REFINE_WINDOW, REFINE_MODULES * module))
+    if window < 1:
+        return corners
+    start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    better = cv2.cornerSubPix(gray, start.copy(), (window, window), (-1, -1), criteria)[:, 0]
+    shift = np.linalg.norm(better - corners, axis=1)
+    good = shift <= max(1.5, MAX_REFINE_SHIFT * module)
+    return np.where(good[:, None], better, corners)
 
 
 def region_around(corners, shape, motion=0.0):

@@ -57,7 +57,7 @@ class MotionSettings:
 
     kinds: tuple = (Motion(), Motion(1.5, 5.0), Motion(6.0, 50.0))
     acceleration_time: float = 0.1
-    kind_time: float = 0.5
+    kind_time: float = 1.5
     rest_speed: float = 0.02
     rest_spin: float = 0.1
     start_speed: float = 0.5

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera, two markers and a hand whose motion is known, at the level of corners: no pictures."""
+
+import contextlib
+
+import cv2
+import numpy as np
+
+from sph_ros.tracking.camera import CameraModel
+from sph_ros.tracking.detection import Detection
+from sph_ros.tracking.motions import hand_motion
+from sph_ros.tracking.se3 import Pose, difference, exp
+from sph_ros.tracking.targets import single_marker
+from sph_ros.tracking.tracker import Tracker, TrackerSettings
+
+FPS = 30.0
+FLAT = np.diag([1.0, -1.0, -1.0])  # a marker that looks straight into the camera
+CAMERA = CameraModel(
+    640, 480, [[560, 0, 321], [0, 562, 238], [0, 0, 1]], [0.1, -0.2, 0.001, -0.001, 0.05]
+)
+WORLD = single_marker("world", 0, 0.08)
+BALL = single_marker("ball", 1, 0.06)
+CAMERA_FROM_WORLD = Pose(exp(np.array([0.6, 0.0, 0.0])) @ FLAT, np.array([-0.08, 0.05, 0.55]))
+CENTRE = Pose(np.eye(3), np.array([0.12, 0.05, 0.06]))
+
+
+def truth_of_hand(seconds, seed=1, **motion):
+    """(times (N,), [world_from_ball], moving (N,) bool)."""
+    times = np.arange(round(seconds * FPS)) / FPS
+    return times, *hand_motion(times, CENTRE, seed=seed, **motion)
+
+
+def seen(target, camera_from_target, rng, noise=0.3, camera=CAMERA):
+    """Detections of a target's markers with noisy corners."""
+    found = []
+    for marker_id, corners in target.corners.items():
+        pixels = camera.project(camera_from_target.apply(corners))
+        found.append(Detection(marker_id, pixels + noise * rng.standard_normal((4, 2))))
+    return found
+
+
+def track_hand(
+    times, truth, filter, noise=0.3, seed=0, drop=0.0, outliers=0.0, lookahead=0.0, **settings
+):
+    """Tracked of the ball at each time, with a share of dropped and of wildly wrong pictures."""
+    rng = np.random.default_rng(seed)
+    tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD, filter=filter, **settings))
+    results = []
+    for time, world_from_ball in zip(times, truth, strict=True):
+        found = seen(WORLD, CAMERA_FROM_WORLD, rng, noise)
+        chance = rng.random()
+        (ball,) = seen(BALL, CAMERA_FROM_WORLD @ world_from_ball, rng, noise)
+        if chance < outliers:
+            ball = ball._replace(corners=ball.corners + rng.uniform(-150, 150, 2))
+        if not outliers <= chance < outliers + drop:
+            found.append(ball)
+        results.append(tracker.track(found, CAMERA, time, lookahead).solids["ball"])
+    return results
+
+
+def errors(results, truth):
+    """(N, 6) errors of poses, NaN where there is none."""
+    missing = np.full(6, np.nan)
+    return np.array(
+        [
+            missing if result.pose is None else difference(result.pose, true)
+            for result, true in zip(results, truth, strict=True)
+        ]
+    )
+
+
+def rms(values):
+    """Root mean square length of rows."""
+    return float(np.sqrt(np.nanmean(np.sum(np.square(values), axis=1))))
+
+
+def jitter(found, moving, settled=12):
+    """Standard deviation (position [m], rotation [rad]) while the hand rests, once settled."""
+    still = np.flatnonzero(~moving)
+    runs = np.split(still, np.flatnonzero(np.diff(still) > 1) + 1)
+    rest = found[max(runs, key=len)[settled:]]
+    spread = np.nanstd(rest, axis=0)
+    return float(np.linalg.norm(spread[:3])), float(np.linalg.norm(spread[3:]))
+
+
+def lag_in_frames(positions, true_positions):
+    """Delay of a trajectory by cross-correlation, to a fortieth of a frame."""
+    index = np.arange(len(positions), dtype=float)
+    inside = slice(5, -5)
+    best = (-np.inf, 0.0)
+    for shift in np.linspace(-2.0, 2.0, 161):
+        moved = np.column_stack([np.interp(index - shift, index, t) for t in true_positions.T])
+        a = positions[inside] - positions[inside].mean(axis=0)
+        b = moved[inside] - moved[inside].mean(axis=0)
+        best = max(best, (float(np.sum(a * b) / np.linalg.norm(a) / np.linalg.norm(b)), shift))
+    return best[1]
+
+
+def plain_pose(pixels, size, camera=CAMERA):
+    """What a plain solver gives: the IPPE solution of less reprojection error."""
+    square = 0.5 * size * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+    _, turn, shift = cv2.solvePnP(
+        square, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    return Pose(cv2.Rodrigues(turn)[0], shift.ravel())
+
+
+@contextlib.contextmanager
+def one_opencv_thread():
+    """Tests share their two cores."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(before)
