@@ -166,7 +166,7 @@ def stable_time_step(scene, scales, drop):
     Returns:
         The step, rounded down to a number people can read, and what bounds it.
     """
-    h, s = scene.support_radius, scene.spacing
+    h = scene.support_radius
     g = math.sqrt(sum(c * c for c in scene.gravity))
     initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
     initial = max(initial, max((e.speed or 0.0 for e in scene.emitters), default=0.0))
