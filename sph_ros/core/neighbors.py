@@ -306,14 +306,25 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
 
 
 @parallel_kernel
-def densities_of_pairs(positions, support_radius, density_scale, wall_density, pairs, density):
+def densities_of_pairs(
+    positions,
+    listed,
+    support_radius,
+    density_scale,
+    wall_density,
+    wall_gradients,
+    pairs,
+    density,
+):
     """Densities of particles that have moved a little since their lists were made.
 
     Args:
         positions: [m], (N, 3).
+        listed: where they were then [m], (N, 3).
         support_radius: h [m], float32.
         density_scale: 1 / lattice sum of the weight [-], float32.
-        wall_density: density that walls add in its first column [-], (N, 2).
+        wall_density: density that walls added then, in its first column [-], (N, 2).
+        wall_gradients: its gradient, in the first three columns [1/m], (N, 6).
         pairs: from `find_neighbors`.
         density: relative to rest [-], (N,); written.
     """
@@ -332,4 +343,7 @@ def densities_of_pairs(positions, support_radius, density_scale, wall_density, p
             u = u if u > np.float32(0.0) else np.float32(0.0)
             w += u * u
         filling = np.float32(end - start - pairs.count[i])
-        density[i] = density_scale * (w - filling) + wall_density[i, 0]
+        wall = wall_density[i, 0]
+        for axis in range(3):
+            wall += wall_gradients[i, axis] * (positions[i, axis] - listed[i, axis])
+        density[i] = density_scale * (w - filling) + max(wall, np.float32(0.0))

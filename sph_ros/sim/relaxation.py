@@ -122,9 +122,11 @@ class RelaxationSolver:
         density = np.empty(len(fluid), np.float32)
         search.densities_of_pairs(
             fluid.positions,
+            work.predicted,
             self._h,
             np.float32(self.scales.density_scale * self._packing),
             work.contacts.density,
+            work.contacts.gradients,
             work.pairs,
             density,
         )

@@ -314,7 +314,7 @@ def _check_solids(scene: Scene, root: Node) -> None:
             raise node.error(
                 f"solid {solid.name!r} overlaps the liquid: {int(inside.sum())} of "
                 f"{len(positions)} particles start inside it, the deepest by "
-                f"{-distance[deepest]:.4g} m at {np.round(positions[deepest], 4).tolist()}"
+                f"{-distance[deepest]:.4g} m at {np.round(positions[deepest].astype(float), 4).tolist()}"
             )
 
 
