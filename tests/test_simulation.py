@@ -233,6 +233,18 @@ def test_liquid_as_thick_as_can_be_turns_like_a_rigid_body():
     assert left == pytest.approx(0.375, rel=0.05)
 
 
+def test_a_step_too_long_to_be_stable_is_cut_into_substeps():
+    sim = sph_ros.Simulation({**SCENE, "time_step": 0.05})
+    for _ in range(20):
+        sim.step()
+    assert sim.time == pytest.approx(1.0)
+    facts = sim.statistics()
+    assert facts["substeps"] > 1 and facts["max_speed"] < 0.5 and facts["lost_particles"] == 0
+    sim.set_material(surface_tension=2.0)
+    sim.step()
+    assert sim.statistics()["substeps"] > facts["substeps"]
+
+
 def test_surface_is_closed_and_holds_the_liquid():
     sim = sph_ros.Simulation({**SCENE, "spacing": 0.01})
     vertices, triangles = sim.surface()

@@ -280,7 +280,23 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                 )
 
 
-@inlined
+@device
+def distance_called(shapes, s, x, y, z):
+    """`signed_distance` as a function of its own.
+
+    Only the few particles that touch a solid get here, and inlining it six times would double the
+    time to compile.
+    """
+    return signed_distance(shapes, s, x, y, z)
+
+
+@device
+def normal_called(shapes, s, x, y, z):
+    """`distance_and_normal` as a function of its own."""
+    return distance_and_normal(shapes, s, x, y, z)
+
+
+@device
 def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest):
     """Share of the way from a to b, in the frame of solid s, at which a point meets it; 1: never.
 
@@ -296,29 +312,29 @@ def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, short
         if along >= length:
             return np.float32(1.0)
         share = along / length
-        distance = signed_distance(shapes, s, ax + share * dx, ay + share * dy, az + share * dz)
+        distance = distance_called(shapes, s, ax + share * dx, ay + share * dy, az + share * dz)
         if distance <= margin:
             return share
     return np.float32(1.0)
 
 
-@inlined
+@device
 def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
     """End of a motion from a to b that slides along solid s where it meets it, solid's frame."""
     dx, dy, dz = bx - ax, by - ay, bz - az
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
-    distance = signed_distance(shapes, s, ax, ay, az)
+    distance = distance_called(shapes, s, ax, ay, az)
     if distance > length + margin:
         return bx, by, bz
     share = first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest)
     if share < np.float32(1.0):
         hx, hy, hz = ax + share * dx, ay + share * dy, az + share * dz
-        _, nx, ny, nz = distance_and_normal(shapes, s, hx, hy, hz)
+        _, nx, ny, nz = normal_called(shapes, s, hx, hy, hz)
         inward = (bx - hx) * nx + (by - hy) * ny + (bz - hz) * nz
         if inward < np.float32(0.0):
             bx, by, bz = bx - inward * nx, by - inward * ny, bz - inward * nz
     for _ in range(4):
-        distance, nx, ny, nz = distance_and_normal(shapes, s, bx, by, bz)
+        distance, nx, ny, nz = normal_called(shapes, s, bx, by, bz)
         if distance >= margin:
             break
         step = margin - distance
@@ -331,7 +347,7 @@ def is_free(shapes, motion, x, y, z, margin):
     """Whether a world point keeps the margin from every solid."""
     for s in range(motion.position.shape[0]):
         lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
-        if signed_distance(shapes, s, lx, ly, lz) < margin:
+        if distance_called(shapes, s, lx, ly, lz) < margin:
             return False
     return True
 
@@ -361,7 +377,7 @@ def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
     return False, x, y, z
 
 
-@inlined
+@device
 def slide_past_solids(
     i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
 ):
@@ -391,7 +407,7 @@ def slide_past_solids(
     return moved
 
 
-@inlined
+@device
 def keep_chunk_outside(
     chunk,
     starts,

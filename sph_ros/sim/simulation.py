@@ -19,7 +19,8 @@ from sph_ros.sim.state import Fluid
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
 SOLID_REACH, PARTICLE_REACH = 0.75, 0.8
 
-#: Substeps in a step, at most; solids are slowed down rather than let through more.
+#: Substeps in a step for the sake of speeds, at most; solids are slowed down rather than let through
+#: more.
 MOST_SUBSTEPS = 8
 
 
@@ -51,22 +52,28 @@ class Simulation:
     def _start(self):
         """First state: the liquid of the scene, solids at their first poses."""
         positions, velocities = fill_liquid(self.scene)
-        depth = liquid_depth(self.scene, positions)
+        self._depth = liquid_depth(self.scene, positions)
         self._fluid = Fluid(positions, velocities)
-        self._solver = RelaxationSolver(self.scene, self._solids, depth)
-        self._solver.set_material(self.material)
-        self.time_step, self.time_step_reason = self._choose_time_step(depth)
+        self._solver = RelaxationSolver(self.scene, self._solids, self._depth)
+        self._use_material(self.material)
+        self.time_step, self.time_step_reason = self._choose_time_step()
         self._steps = 0
         self._substeps = 1
         self._reactions = np.zeros((len(self._solids), 6))
         self._densities = None
         self.timings = {}
 
-    def _choose_time_step(self, depth):
+    def _choose_time_step(self):
         """The scene's time step, or one that keeps it stable, and why."""
         if self.scene.time_step is not None:
             return self.scene.time_step, "given by the scene"
-        return stable_time_step(self.scene, self._solver.scales, depth)
+        return stable_time_step(self.scene, self._solver.scales, self._depth)
+
+    def _use_material(self, material):
+        """Hand a material to the solver; the longest stable substep goes with it."""
+        self.material = material
+        self._solver.set_material(material)
+        self._stable_step, _ = stable_time_step(self.scene, self._solver.scales, self._depth)
 
     # ---------------------------------------------------------------- time
 
@@ -94,7 +101,7 @@ class Simulation:
         self._densities = None
 
     def _substep_count(self):
-        """Substeps that keep solids and particles within their reach."""
+        """Substeps that keep solids and particles within their reach, and the liquid stable."""
         dt = self.time_step
         ahead = min(self._solids.distance_ahead(self.time, dt), self.scene.max_solid_speed * dt)
         particle = self._solver.fastest * dt
@@ -102,7 +109,8 @@ class Simulation:
             ahead / (SOLID_REACH * self.scene.spacing),
             particle / (PARTICLE_REACH * self.scene.support_radius),
         )
-        return min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
+        for_speed = min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
+        return max(for_speed, math.ceil(dt / self._stable_step - 1e-6))
 
     def advance(self, seconds):
         """Advance by whole steps until at least `seconds` [s] more are simulated."""
@@ -137,8 +145,7 @@ class Simulation:
         simulation = cls(scene)
         simulation._fluid = Fluid.of_arrays(arrays)
         simulation._densities = arrays["densities"]
-        simulation.material = material
-        simulation._solver.set_material(material)
+        simulation._use_material(material)
         simulation._solver.set_state(numbers["solver"])
         simulation._steps = numbers["steps"]
         for name, state in numbers["solids"].items():
@@ -185,8 +192,7 @@ class Simulation:
         Raises:
             ValueError: an unknown field, or a value out of its range; nothing is changed then.
         """
-        self.material = changed(self.material, **fields)
-        self._solver.set_material(self.material)
+        self._use_material(changed(self.material, **fields))
 
     def surface(self):
         """The liquid's surface as triangles.
