@@ -19,8 +19,7 @@ from sph_ros.sim.state import Fluid
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
 SOLID_REACH, PARTICLE_REACH = 0.75, 0.8
 
-#: Substeps in a step for the sake of speeds, at most; solids are slowed down rather than let through
-#: more.
+#: Substeps in a step for the sake of speeds, at most; rather than more, solids are slowed down.
 MOST_SUBSTEPS = 8
 
 
