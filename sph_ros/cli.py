@@ -8,6 +8,8 @@ import argparse
 import os
 import sys
 
+from sph_ros.options import picture_size, positive, remapping
+
 
 def main(argv=None):
     """Run `sph_ros ARGS`; returns the exit status.
@@ -23,11 +25,11 @@ def main(argv=None):
     options = _parser().parse_args(argv)
     try:
         return options.run(options)
-    except _user_errors() as error:
-        print(f"sph_ros {options.command}: {error}", file=sys.stderr)
-        return 1
     except BrokenPipeError:  # the reader of our output went away, as in `sph_ros scenes | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (*_user_errors(), OSError) as error:  # a full disk, a folder that cannot be made
+        print(f"sph_ros {options.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"sph_ros {options.command}: interrupted, nothing was written", file=sys.stderr)
@@ -85,17 +87,19 @@ def _add_simulate(commands):
         "--remap",
         action="append",
         default=[],
-        type=_remap,
+        type=remapping,
         metavar="A:=B",
         help="poses on the bag's topic A move the solid B (a name, or its pose topic); may repeat",
     )
     add("--ignore-frame", action="store_true", help="take poses in any frame as the scene's frame")
-    add("--seconds", type=_positive, help="how long; default: the bag's length, else 5")
+    add("--seconds", type=positive, help="how long; default: the bag's length, else 5")
     add("--out", metavar="DIR", help="folder to make; default: out/SCENE")
     add("--force", action="store_true", help="replace results that DIR holds already")
-    add("--fps", type=_positive, default=30.0, help="recorded frames per second (default: 30)")
+    add("--fps", type=positive, default=30.0, help="recorded frames per second (default: 30)")
     add("--no-video", dest="video", action="store_false", help="no video.mp4, no last.png")
-    add("--size", type=_size, default=(960, 720), metavar="WxH", help="of the video [pixels]")
+    add(
+        "--size", type=picture_size, default=(960, 720), metavar="WxH", help="of the video [pixels]"
+    )
     simulate.set_defaults(run=_simulate)
 
 
@@ -106,53 +110,29 @@ def _add_tracking(commands):
     add_calibrate(commands)
 
 
-# ---------------------------------------------------------------- options
-
-
-def _positive(text):
-    value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
-def _size(text):
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 960x720, got {text!r}")
-    size = int(width), int(height)
-    if not all(16 <= side <= 8192 and side % 2 == 0 for side in size):
-        raise argparse.ArgumentTypeError(f"expected even numbers from 16 to 8192, got {text!r}")
-    return size
-
-
-def _remap(text):
-    source, sign, target = text.partition(":=")
-    if not (source and sign and target):
-        raise argparse.ArgumentTypeError(f"expected A:=B, got {text!r}")
-    return source, target
-
-
 # ---------------------------------------------------------------- subcommands
 
 
 def _scenes(_options):
     from sph_ros.sim.scene import list_scenes, load_scene
+    from sph_ros.waiting import preparing
 
-    for name in list_scenes():
-        print(f"{name:16} {load_scene(name).description}")
+    with preparing():
+        scenes = [load_scene(name) for name in list_scenes()]
+    for scene in scenes:
+        print(f"{scene.name:16} {scene.description}")
     return 0
 
 
 def _check(options):
     from sph_ros.sim.liquid import BYTES_PER_PARTICLE, available_memory
     from sph_ros.sim.scene import load_scene
-
-    scene = load_scene(options.scene)
-
     from sph_ros.sim.simulation import Simulation
+    from sph_ros.waiting import preparing
 
-    sim = Simulation(scene)
+    with preparing():
+        scene = load_scene(options.scene)
+        sim = Simulation(scene)
     count = len(sim.positions)
     needed = count * BYTES_PER_PARTICLE
     chosen = "chosen" if scene.time_step is None else "given"

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from sph_ros.options import positive
 from sph_ros.processes import ChildError, Children
 
 DEFAULT_PORT = 8080
@@ -50,7 +51,7 @@ def main(argv=None):
             print("sph_ros demo: interrupted, nothing was written", file=sys.stderr)
             return 130
         return 0
-    except (*_user_errors(), DemoError, ChildError) as error:
+    except (*_user_errors(), DemoError, ChildError, OSError) as error:
         print(f"sph_ros demo: {error}", file=sys.stderr)
         return 1
     finally:
@@ -81,8 +82,8 @@ def _parse(argv):
     add = parser.add_argument
     add("--scene", default="ball_tank", help="packaged name or YAML file (ball_tank)")
     add("--bag", default=None, help="recorded poses: packaged name or path (hand_stir)")
-    add("--rate", type=_positive, default=1.0, help="times the recorded speed (1)")
-    add("--seconds", type=_positive, help="how long; the live view runs until Ctrl-C, a video 10 s")
+    add("--rate", type=positive, default=1.0, help="times the recorded speed (1)")
+    add("--seconds", type=positive, help="how long; the live view runs until Ctrl-C, a video 10 s")
     add("--headless", action="store_true", help="no browser: record, then draw into --out")
     add("--out", metavar="DIR", help="folder for the results of --headless (out/demo)")
     add("--force", action="store_true", help="replace the results that are in DIR already")
@@ -98,13 +99,6 @@ def _parse(argv):
     return options
 
 
-def _positive(text):
-    value = float(text)
-    if not 0.0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
 def _run(options):
     from sph_ros.sim.scene import load_scene
 
@@ -117,7 +111,7 @@ def _run(options):
 
 def _hand(scene, bag):
     """Arguments for bag_player; None when nothing in the scene follows poses."""
-    from msg_adapters.bags import open_bag
+    from msg_adapters.bags import open_bag, read_poses
     from msg_adapters.pose import POSE_STAMPED
     from sph_ros.sim.scene import bag_path
 
@@ -129,6 +123,7 @@ def _hand(scene, bag):
     path = bag_path(bag or "hand_stir")
     with open_bag(path) as reader:
         topic = reader.only_topic(POSE_STAMPED).name
+    read_poses(path, topic)  # whatever is wrong with them is said before anything starts
     target = f"/fluid/solids/{controlled[0]}/pose"
     return [str(path), "--loop", "--topics", topic, "--remap", f"{topic}:={target}"]
 

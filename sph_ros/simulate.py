@@ -18,6 +18,7 @@ from sph_ros.render.plots import plot_history
 from sph_ros.sim.scene import bag_path, load_scene
 from sph_ros.sim.simulation import Simulation
 from sph_ros.tracks import read_tracks
+from sph_ros.waiting import preparing, warm_up
 
 DEFAULT_SECONDS = 5.0
 
@@ -93,18 +94,19 @@ def simulate(
     Raises:
         SceneError, BagError, SimulateError: before anything is written.
     """
-    scene = load_scene(scene)
-    tracks, start_ns = [], 0
-    if bag is not None:
-        tracks, start_ns = read_tracks(bag_path(bag), scene, remaps, ignore_frame)
-    elif remaps:
-        raise SimulateError("--remap needs a --bag whose topics it can remap")
-    out = Path("out") / scene.name if out is None else Path(out)
-    _check_folder(out, force)
+    with preparing():
+        scene = load_scene(scene)
+        tracks, start_ns = [], 0
+        if bag is not None:
+            tracks, start_ns = read_tracks(bag_path(bag), scene, remaps, ignore_frame)
+        elif remaps:
+            raise SimulateError("--remap needs a --bag whose topics it can remap")
+        out = Path("out") / scene.name if out is None else Path(out)
+        _check_folder(out, force)
+        sim = Simulation(scene)
+        warm_up(sim)
     wanted = seconds or max((float(track.times[-1]) for track in tracks), default=0.0)
     wanted = wanted or DEFAULT_SECONDS
-
-    sim = Simulation(scene)
     for track in tracks:
         for moment, position, quat_xyzw in zip(*track[1:], strict=True):
             sim.move_solid(track.solid, position, quat_xyzw, time=float(moment))
@@ -117,29 +119,39 @@ def simulate(
 
 def _run(sim, folder, start_ns, wanted, fps, size):
     """Step and record; returns (frames, whether it reached the end)."""
-    history, complete, frames = History(), True, 0
+    history, complete, frames = History(), True, 1
     frame_count = int(wanted * fps + 1e-6) + 1
     with ExitStack() as stack:
         stopped = stack.enter_context(_ctrl_c())
         bag = stack.enter_context(BagRecorder(folder, sim, start_ns))
         film = stack.enter_context(_film(sim.scene, folder, size, fps)) if size else None
+        with preparing():  # drawing has its own kernels
+            _record(sim, bag, history, film)
         bar = tqdm(total=wanted, unit="s", disable=None, leave=False, bar_format=_BAR)
         stack.enter_context(bar)
-        for frame in range(frame_count):
-            _advance_to(sim, frame / fps, stopped)
-            if stopped.is_set() and frames > 0:
+        while frames < frame_count:
+            _advance_to(sim, frames / fps, stopped)
+            if stopped.is_set():
                 complete = False
                 break
-            surface = _surface(sim)
-            bag.add(surface)
-            history.add(sim)
-            if film:
-                film.add(sim.positions, sim.velocities, surface, _poses(sim))
+            _record(sim, bag, history, film)
             frames += 1
             bar.update(min(sim.time, wanted) - bar.n)
     history.write_csv(folder / "history.csv")
     plot_history(folder / "history.png", history.arrays(), sim.scene.name)
     return frames, complete
+
+
+def _record(sim, bag, history, film):
+    """The present state into all that a run leaves behind."""
+    scene = sim.scene
+    surface = extract_surface(
+        sim.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
+    )
+    bag.add(surface)
+    history.add(sim)
+    if film:
+        film.add(sim.positions, sim.velocities, surface, _poses(sim))
 
 
 _BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated, {elapsed} gone, {remaining} to go"
@@ -153,14 +165,6 @@ def _poses(sim):
     """Of all solids: name -> (position, quat_xyzw)."""
     solids = [sim.solid(name) for name in sim.solid_names]
     return {solid.name: (solid.position, solid.quat_xyzw) for solid in solids}
-
-
-def _surface(sim):
-    """(vertices, triangles, normals) of the liquid's surface."""
-    scene = sim.scene
-    return extract_surface(
-        sim.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
-    )
 
 
 def _advance_to(sim, moment, stopped):

@@ -211,10 +211,10 @@ def test_errors_are_one_line_and_an_exit_status(bag, tmp_path, capsys, arguments
 
 def test_usage_errors():
     for option, expected in (
-        (["--rate", "0"], "0 is not above 0"),
-        (["--rate", "nan"], "nan is not above 0"),
-        (["--delay", "-1"], "-1 is not 0 or above"),
-        (["--remap", "a"], "a is not of the form A:=B"),
+        (["--rate", "0"], "above 0, got '0'"),
+        (["--rate", "nan"], "above 0, got 'nan'"),
+        (["--delay", "-1"], "at least 0, got '-1'"),
+        (["--remap", "a"], "expected A:=B, got 'a'"),
     ):
         done = subprocess.run(
             [sys.executable, "-m", PLAYER, "bag", *option], capture_output=True, text=True

@@ -110,6 +110,15 @@ def test_bags_that_cannot_be_used(capsys, tmp_path, shared_data):
         assert error.count("\n") == 1 and not out.exists()
 
 
+def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):
+    scene = tmp_path / "drop.yaml"
+    scene.write_text("spacing: 0.02\nliquid:\n  - box: {min: [0, 0, 0], max: [0.1, 0.1, 0.1]}\n")
+    arguments = [scene, "--seconds", "0.01", "--no-video", "--out", "/proc/results/here"]
+    status, out, error = run(capsys, "simulate", *arguments)
+    assert status == 1 and out == "" and error.count("\n") == 1
+    assert "/proc/results" in error
+
+
 def test_demo_has_its_own_options(capsys):
     status, out, _ = run(capsys, "demo", "--help")
     assert status == 0 and "--headless" in out

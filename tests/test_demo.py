@@ -13,9 +13,10 @@ from pathlib import Path
 import cv2
 import pytest
 
-from msg_adapters.bags import open_bag
+from msg_adapters.bags import BagWriter, open_bag
 from msg_adapters.header import NANOSECONDS
 from msg_adapters.point_cloud import cdr_to_particle_cloud
+from msg_adapters.pose import POSE_STAMPED, pose_to_cdr
 from sph_ros.processes import ChildError, Children
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -153,6 +154,18 @@ def test_mistakes_are_said_in_one_line(arguments, status, text, tmp_path):
     assert demo.wait(30.0) == status
     log = (tmp_path / "log.txt").read_text()
     assert text in log.strip().splitlines()[-1] and "Traceback" not in log
+
+
+def test_a_bag_with_two_clocks_is_refused_before_anything_starts(tmp_path):
+    with BagWriter(tmp_path / "two_clocks") as bag:
+        for stamp in (50 * NANOSECONDS, 51 * NANOSECONDS, 1 * NANOSECONDS):
+            pose = pose_to_cdr((0.1, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0), stamp, "world")
+            bag.write("/hand", POSE_STAMPED, 50 * NANOSECONDS, pose)
+    demo = start_demo(tmp_path, "--headless", "--bag", tmp_path / "two_clocks")
+    assert demo.wait(30.0) == 1
+    log = (tmp_path / "log.txt").read_text()
+    assert log.count("\n") == 1 and "stamps of one clock" in log and "two_clocks" in log
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.txt", "two_clocks"]
 
 
 def test_children_report_their_last_words():

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 import re
 import struct
 import sys
@@ -28,6 +27,7 @@ from msg_adapters.bags import BagMessage, BagReader, Topic, check_clocks, open_b
 from msg_adapters.cdr import byte_order
 from msg_adapters.clock import CLOCK, clock_to_cdr
 from msg_adapters.header import NANOSECONDS, split_stamp
+from sph_ros.options import not_negative, positive, remapping
 
 # Enough for a subscriber that is briefly busy; a depth of one loses messages of some megabytes.
 PUBLISHER_DEPTH = 100
@@ -218,27 +218,27 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
         "bag", help="folder with metadata.yaml, .mcap or .db3 file, or a packaged bag"
     )
     parser.add_argument(
-        "--rate", type=_positive, default=1.0, metavar="R", help="times recorded speed (1)"
+        "--rate", type=positive, default=1.0, metavar="R", help="times recorded speed (1)"
     )
     parser.add_argument(
         "--loop", action="store_true", help="start over at the end; recorded stamps jump back"
     )
     parser.add_argument(
-        "--remap", type=_remapping, nargs="+", action="extend", default=[], metavar="A:=B",
+        "--remap", type=remapping, nargs="+", action="extend", default=[], metavar="A:=B",
         help="publish topic A of the bag as B",
     )  # fmt: skip
     parser.add_argument(
         "--topics", nargs="+", metavar="TOPIC", help="play only these topics of the bag"
     )
     parser.add_argument(
-        "--clock", type=_positive, nargs="?", const=DEFAULT_CLOCK_RATE, metavar="HZ",
+        "--clock", type=positive, nargs="?", const=DEFAULT_CLOCK_RATE, metavar="HZ",
         help="publish the recorded time on /clock, so often a second (100)",
     )  # fmt: skip
     parser.add_argument(
-        "--delay", type=_not_negative, default=0.0, metavar="S", help="wait so long first [s] (0)"
+        "--delay", type=not_negative, default=0.0, metavar="S", help="wait so long first [s] (0)"
     )
     parser.add_argument(
-        "--wait", type=_not_negative, default=5.0, metavar="S",
+        "--wait", type=not_negative, default=5.0, metavar="S",
         help="wait at most so long for a first subscriber [s] (5)",
     )  # fmt: skip
     parser.add_argument(
@@ -311,27 +311,6 @@ def _message_class(name: str) -> type | None:
 def _starts_with_header(message_class: type) -> bool:
     fields = message_class.get_fields_and_field_types()
     return next(iter(fields.values()), None) == "std_msgs/Header"
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (value > 0.0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return value
-
-
-def _not_negative(text: str) -> float:
-    value = float(text)
-    if not value >= 0.0:
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or above")
-    return value
-
-
-def _remapping(text: str) -> tuple[str, str]:
-    old, separator, new = text.partition(":=")
-    if not (old and separator and new):
-        raise argparse.ArgumentTypeError(f"{text} is not of the form A:=B")
-    return old, new
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ whatever comes then (a bag that loops, a simulator that was reset) is another ru
 """
 
 import sys
-import threading
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
@@ -40,6 +39,7 @@ from sph_ros.nodes.running import run_node
 from sph_ros.nodes.schedules import ClockSchedule, WallSchedule
 from sph_ros.nodes.surface_worker import SurfaceWorker
 from sph_ros.sim.scene import SceneError, load_scene
+from sph_ros.waiting import tell_while_waiting, warm_up
 
 #: Warnings of one kind are at least so far apart [s].
 WARNING_PERIOD = 5.0
@@ -71,10 +71,11 @@ class FluidNode(Node):
     def _set_up(self):
         self._settings = Settings(self)
         scene_name, self._step_mode = self._settings.declare_fixed()
-        scene = load_scene(scene_name)
-        self._settings.declare_live(scene.material, self._step_mode)
-        self._runner = Runner(scene, self._settings.material())
-        self._warm_up()
+        with tell_while_waiting(self._tell):
+            scene = load_scene(scene_name)
+            self._settings.declare_live(scene.material, self._step_mode)
+            self._runner = Runner(scene, self._settings.material())
+            warm_up(self._runner.sim)
         self._publications = Publications(self, self._runner)
         self._surfaces = SurfaceWorker(self._publications.surface, self._warn_of_surface)
         self._driver = self._make_driver()
@@ -101,24 +102,10 @@ class FluidNode(Node):
 
     # ---------------------------------------------------------------- start
 
-    def _warm_up(self):
-        """Compile before the first tick, and say so when it takes a while."""
-        ready = threading.Event()
-
-        def tell():
-            seconds = 0
-            while not ready.wait(2.0):
-                seconds += 2
-                text = f"compiling kernels, first run only: {seconds} s"
-                self.get_logger().info(text)
-
-        teller = threading.Thread(target=tell, name="warm_up", daemon=True)
-        teller.start()
-        try:
-            self._runner.warm_up()
-        finally:
-            ready.set()
-            teller.join()
+    def _tell(self, seconds):
+        self.get_logger().info(
+            f"preparing, the first run compiles for up to a minute: {seconds:.0f} s"
+        )
 
     def _make_driver(self):
         if self._step_mode == "lockstep":

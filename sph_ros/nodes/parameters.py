@@ -2,6 +2,7 @@
 """Parameters of the fluid node: declared once, described, ranged; checked first, applied later."""
 
 import math
+import re
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -124,11 +125,7 @@ class Settings:
                 f"parameter {name}: expected {_type_name(default)}, {error}"
             ) from error
         except InvalidParameterValueException as error:
-            limits = "".join(
-                f", expected {limit.from_value:g} to {limit.to_value:g}"
-                for limit in descriptor.floating_point_range
-            )
-            raise ParameterError(f"parameter {name}: {error}{limits}") from error
+            raise ParameterError(f"parameter {name}: {_refusal(descriptor, error)}") from error
 
     def _check(self, parameters):
         """Refuse a material that cannot be; rclpy has checked types and ranges. Changes nothing."""
@@ -154,6 +151,15 @@ def within_range(field, value):
         if math.isclose(value, bound, rel_tol=1e-6):
             return bound
     return value
+
+
+def _refusal(descriptor, error):
+    """What was expected and given; rclpy tells the value only within its sentence."""
+    given = re.search(r"Invalid parameter value \((.*?)\)", str(error))
+    if not (given and descriptor.floating_point_range):
+        return str(error)
+    limit = descriptor.floating_point_range[0]
+    return f"expected {limit.from_value:g} to {limit.to_value:g}, got {given[1]}"
 
 
 def _type_name(value):

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from sph_ros.core.surface import extract_surface
 from sph_ros.sim.simulation import Simulation
 
 
@@ -34,16 +33,6 @@ class Runner:
         self.fault = None
         self.steps, self.busy, self.part_times = 0, 0.0, {}
         self._clear_wrenches()
-
-    def warm_up(self):
-        """Compile all that a running node calls, so that its first tick is like the others."""
-        self.sim.step()
-        self.statistics()
-        scene = self.sim.scene
-        extract_surface(
-            self.sim.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
-        )
-        self.sim.reset()
 
     def step(self):
         """One time step; an exception becomes `fault`. Returns whether it went well."""

@@ -311,10 +311,11 @@ def _check_solids(scene: Scene, root: Node) -> None:
         inside = distance < -0.5 * scene.spacing
         if inside.any():
             deepest = int(np.argmin(distance))
+            place = [round(float(x), 4) for x in positions[deepest]]
             raise node.error(
                 f"solid {solid.name!r} overlaps the liquid: {int(inside.sum())} of "
                 f"{len(positions)} particles start inside it, the deepest by "
-                f"{-distance[deepest]:.4g} m at {np.round(positions[deepest].astype(float), 4).tolist()}"
+                f"{-distance[deepest]:.4g} m at {place}"
             )
 
 
