@@ -7,6 +7,9 @@ import math
 import numba
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 import sph_ros
 
@@ -238,6 +241,19 @@ def test_a_cubic_drop_becomes_rounder_and_stays_whole():
     sim.advance(0.4)
     assert before > 1.2
     assert corner_excess() < 1.15
+    assert sim.statistics()["max_speed"] < 0.5
+
+
+def test_a_marker_that_jumps_does_not_splatter_the_drop():
+    """What Fujisawa & Kato 2009 report of theirs: the box is told a pose on the drop's other side."""
+    sim = sph_ros.Simulation("drop_box")
+    sim.advance(0.05)
+    for position in ([-0.05, 0, 0], [0.05, 0.01, 0.0], [0.0, 0.0, 0.05]):
+        sim.move_solid("box", position)
+        sim.advance(0.4)
+    near = cKDTree(sim.positions).query_pairs(1.8 * sim.scene.spacing, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), near.T), shape=(sim.particle_count,) * 2)
+    assert connected_components(links, directed=False)[0] == 1
     assert sim.statistics()["max_speed"] < 0.5
 
 
