@@ -245,7 +245,7 @@ def test_a_cubic_drop_becomes_rounder_and_stays_whole():
 
 
 def test_a_marker_that_jumps_does_not_splatter_the_drop():
-    """What Fujisawa & Kato 2009 report of theirs: the box is told a pose on the drop's other side."""
+    """What Fujisawa & Kato 2009 report of theirs: poses on the other side of the drop, at once."""
     sim = sph_ros.Simulation("drop_box")
     sim.advance(0.05)
     for position in ([-0.05, 0, 0], [0.05, 0.01, 0.0], [0.0, 0.0, 0.05]):
