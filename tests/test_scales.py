@@ -24,7 +24,7 @@ pytestmark = pytest.mark.nojit
 
 
 def test_lattice_sums_by_hand():
-    """H = 2 s: in 3D 6 neighbours at s, 12 at sqrt 2 s, 8 at sqrt 3 s; those at 2 s weigh nothing."""
+    """At h = 2 s: in 3D 6 neighbours at s, 12 at sqrt 2 s, 8 at sqrt 3 s; at 2 s weight is 0."""
     near, edge, corner = 0.5, 1 - math.sqrt(2) / 2, 1 - math.sqrt(3) / 2
     for power in (2, 3):
         expected = 1 + 6 * near**power + 12 * edge**power + 8 * corner**power
@@ -34,7 +34,7 @@ def test_lattice_sums_by_hand():
         )
 
 
-@pytest.mark.parametrize(("power", "dimension"), itertools.product((2, 3), (2, 3)))
+@pytest.mark.parametrize(("power", "dimension"), list(itertools.product((2, 3), (2, 3))))
 def test_virial_is_the_change_of_the_sum_when_the_lattice_is_squeezed(power, dimension):
     """D sum / d ln volume = -virial: squeeze the spacing, keep the support."""
     small, squeeze = 1e-6, 1e-6 * dimension
