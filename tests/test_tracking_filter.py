@@ -346,8 +346,10 @@ def test_without_the_world_marker_there_is_no_pose_and_a_clear_word():
         result = tracker.track(found, CAMERA, k / FPS)
     assert result.solids["ball"].pose is not None and not result.problems
     for k in range(20, 60):  # covered by a hand: the camera is taken as still
-        result = tracker.track(seen(BALL, ball, rng), CAMERA, k / FPS)
+        moved = Pose(np.eye(3), np.array([0.1 + 0.002 * (k - 20), 0.0, 0.05]))
+        result = tracker.track(seen(BALL, CAMERA_FROM_WORLD @ moved, rng), CAMERA, k / FPS)
     assert result.solids["ball"].status == "tracking"
+    assert np.allclose(result.solids["ball"].pose.position, moved.position, atol=0.01)
 
 
 def test_the_same_id_twice_uses_the_one_that_was_there():

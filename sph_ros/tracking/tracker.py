@@ -254,11 +254,10 @@ class Tracker:
         """(Pose, covariance) of the world in the camera's frame; None when not known."""
         if self.settings.world is None:
             return IDENTITY, np.zeros((6, 6))
-        followed = self._followed[self.settings.world.name]
-        if followed.track.age(time) > self.settings.world_hold:
+        track = self._followed[self.settings.world.name].track
+        if track.age(time) > self.settings.world_hold:
             return None
-        estimate = followed.track.at(time)
-        return estimate.pose, estimate.covariance[:6, :6]
+        return track.at(time).pose, held_covariance(track, time)
 
     def _world_problem(self, world):
         ids = ", ".join(map(str, self.settings.world.ids[:5]))
@@ -340,7 +339,7 @@ class _Followed:
         if estimate is not None and self.track.age(time) <= hold:
             in_camera = estimate.pose
             pose = in_camera.inverse()
-            covariance = inverse_covariance(in_camera, estimate.covariance[:6, :6])
+            covariance = inverse_covariance(in_camera, held_covariance(self.track, time))
         return self._make(self.track.status(time), pose, covariance, in_camera, time, estimate)
 
     def _bounded(self, estimate, time):
@@ -361,6 +360,20 @@ class _Followed:
             self.track.age(time),
             weights,
         )
+
+
+def held_covariance(track, time):
+    """Covariance (6, 6) of a target that nobody may have moved since it was last seen.
+
+    While a hand hides the world marker, a camera that rested is taken to rest on; without this the
+    doubt about the world would grow until no measurement of a solid counted any more.
+    """
+    seen = track.at(track.seen)
+    if len(seen.weights) == 1:  # not a Kalman filter's
+        return seen.covariance[:6, :6]
+    kinds = track.settings.motion.kinds
+    resting = seen.weights[[kind.acceleration is None for kind in kinds]].sum()
+    return (seen if resting > 0.5 else track.at(time)).covariance[:6, :6]
 
 
 def _in_reference(base, camera_from_target, covariance):

@@ -56,8 +56,8 @@ class TrackSettings:
     stop_time: float = 0.1
     lost_time: float = 0.5
     min_cutoff: float = 1.0
-    speed_coefficient: float = 20.0
-    angular_coefficient: float = 4.0
+    speed_coefficient: float = 100.0
+    angular_coefficient: float = 12.0
     derivative_cutoff: float = 1.0
 
 

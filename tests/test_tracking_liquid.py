@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's failure, cured: a drop pushed by a tracked box stays together as with true poses."""
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from tracking_helpers import BALL, CAMERA, CAMERA_FROM_WORLD, FPS, WORLD, seen
+
+from sph_ros.sim.scene import load_scene
+from sph_ros.sim.simulation import Simulation
+from sph_ros.tracking.motions import smooth_noise
+from sph_ros.tracking.se3 import Pose, exp
+from sph_ros.tracking.tracker import Tracker, TrackerSettings
+
+SECONDS = 3.0
+DROPPED, OUTLIERS = 0.10, 0.02
+
+
+def push(times):
+    """A hand that brings the box to the drop and kneads it: [world_from_box]."""
+    rng = np.random.default_rng(5)
+    approach = np.clip(times / 0.8, 0.0, 1.0)
+    approach = approach**2 * (3.0 - 2.0 * approach)
+    places = smooth_noise(times, rng, (0.3, 0.8), 0.0015)
+    places[:, 0] += 0.05 - 0.019 * approach
+    turns = exp(smooth_noise(times, rng, (0.3, 0.8), 0.03))
+    return [Pose(turn, place) for turn, place in zip(turns, places, strict=True)]
+
+
+def tracked(times, truth, filter):
+    """The same as a camera sees it; a picture without a pose moves nothing."""
+    rng = np.random.default_rng(11)
+    tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD, filter=filter))
+    poses = []
+    later = rng.permutation(np.arange(6, len(times)))  # not before there is a track
+    wrong, later = np.split(later, [round(OUTLIERS * len(times))])
+    dropped = later[: round(DROPPED * len(times))]
+    for k, (time, pose) in enumerate(zip(times, truth, strict=True)):
+        found = seen(WORLD, CAMERA_FROM_WORLD, rng)
+        (box,) = seen(BALL, CAMERA_FROM_WORLD @ pose, rng)
+        if k in wrong:
+            box = box._replace(corners=box.corners + rng.uniform(-150, 150, 2))
+        if k not in dropped:
+            found.append(box)
+        poses.append(tracker.track(found, CAMERA, time).solids["ball"].pose)
+    return poses
+
+
+def particles_that_leave(times, poses):
+    """Run `drop_box`; ids of particles that are no longer connected with the drop at the end."""
+    scene = load_scene("drop_box")
+    sim = Simulation(scene)
+    for time, pose in zip(times, poses, strict=True):
+        if pose is not None:
+            sim.move_solid("box", pose.position, pose.quat_xyzw, time=float(time))
+    sim.advance(SECONDS)
+    pairs = cKDTree(sim.positions).sparse_distance_matrix(
+        cKDTree(sim.positions), 2.0 * scene.spacing
+    )
+    _, labels = connected_components(pairs)
+    return set(sim.ids[labels != np.bincount(labels).argmax()].tolist())
+
+
+def test_no_particle_leaves_the_drop_that_stays_with_true_poses():
+    times = np.arange(round(SECONDS * FPS)) / FPS
+    truth = push(times)
+    with_truth = particles_that_leave(times, truth)
+    with_kalman = particles_that_leave(times, tracked(times, truth, "kalman"))
+    with_none = particles_that_leave(times, tracked(times, truth, "none"))
+    print(f"left: {len(with_truth)} true, {len(with_kalman)} filtered, {len(with_none)} unfiltered")
+    assert len(with_none) > 100  # the drop splatters
+    assert with_kalman <= with_truth
