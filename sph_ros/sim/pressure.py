@@ -7,9 +7,10 @@ from sph_ros.core import relaxation as relax
 
 LEAST_ITERATIONS, MOST_ITERATIONS = 2, 60
 
-#: Share of the Jacobi correction taken in each iteration. It has to shrink with the number of
-#: neighbours; when iterations diverge it does, for good.
-FIRST_SHARE, SHRINK = 0.4, 0.7
+#: Share of the Jacobi correction taken in each iteration. It has to be smaller the more neighbours
+#: there are: it shrinks when iterations diverge and grows back slowly.
+FIRST_SHARE, LEAST_SHARE = 0.4, 0.05
+SHRINK, GROW = 0.7, 1.01
 
 #: Nesterov's sequence begins here and not at 1: a warm start is wrong at long waves, which only
 #: momentum reaches. Saves a third of the iterations in a stirred tank.
@@ -58,7 +59,7 @@ def solve_pressures(work, gradients, compliance, goal, share):
         if iteration >= LEAST_ITERATIONS and error <= goal:
             break
         if error > 3.0 * best:
-            share *= SHRINK
+            share = max(SHRINK * share, LEAST_SHARE)
             work.scaled[:] = first
             restart = True
         # Extrapolation that made it worse starts over (O'Donoghue & Candes 2015).
@@ -67,4 +68,4 @@ def solve_pressures(work, gradients, compliance, goal, share):
     relax.pressure_displacements(
         work.pairs, work.scaled, gradients, work.cohesive, work.displacements
     )
-    return iteration, error, share
+    return iteration, error, min(GROW * share, FIRST_SHARE)
