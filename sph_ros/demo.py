@@ -24,6 +24,10 @@ DEFAULT_SECONDS = 10.0
 #: Processes of one machine find each other within a second [s].
 MOST_DISCOVERY = 15.0
 
+#: Recorded hands that suit a packaged scene; all others get DEFAULT_HAND.
+HANDS = {"drop_box": "hand_push"}
+DEFAULT_HAND = "hand_stir"
+
 VIDEO_SIZE = (960, 720)
 RESULTS = ("bag", "demo.mp4", "last.png")
 
@@ -81,7 +85,7 @@ def _parse(argv):
     )
     add = parser.add_argument
     add("--scene", default="ball_tank", help="packaged name or YAML file (ball_tank)")
-    add("--bag", default=None, help="recorded poses: packaged name or path (hand_stir)")
+    add("--bag", default=None, help="recorded poses: packaged name or path (one that suits)")
     add("--rate", type=positive, default=1.0, help="times the recorded speed (1)")
     add("--seconds", type=positive, help="how long; the live view runs until Ctrl-C, a video 10 s")
     add("--headless", action="store_true", help="no browser: record, then draw into --out")
@@ -120,7 +124,7 @@ def _hand(scene, bag):
         if bag is not None:
             raise DemoError(f"--bag: no solid of {scene.source} has `control: topic`")
         return None
-    path = bag_path(bag or "hand_stir")
+    path = bag_path(bag or HANDS.get(scene.name, DEFAULT_HAND))
     with open_bag(path) as reader:
         topic = reader.only_topic(POSE_STAMPED).name
     read_poses(path, topic)  # whatever is wrong with them is said before anything starts

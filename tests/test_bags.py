@@ -395,13 +395,14 @@ def hand_bag_maker():
     return module
 
 
-def test_the_packaged_hand_is_what_its_maker_makes(tmp_path):
-    hand_bag_maker().write_hand_bag(tmp_path / "hand_stir")
-    packaged, made = BAGS / "hand_stir", tmp_path / "hand_stir"
+@pytest.mark.parametrize("name", ["hand_stir", "hand_push"])
+def test_packaged_hands_are_what_their_maker_makes(name, tmp_path):
+    hand_bag_maker().write_hand_bag(name, tmp_path / name)
+    packaged, made = BAGS / name, tmp_path / name
     library = f"rosbags-{version('rosbags')}".encode()
-    if library in (packaged / "hand_stir.mcap").read_bytes()[:60]:
-        for name in ("hand_stir.mcap", "metadata.yaml"):
-            assert (made / name).read_bytes() == (packaged / name).read_bytes()
+    if library in (packaged / f"{name}.mcap").read_bytes()[:60]:
+        for file in (f"{name}.mcap", "metadata.yaml"):
+            assert (made / file).read_bytes() == (packaged / file).read_bytes()
     with open_bag(made) as one, open_bag(packaged) as two:  # whatever library wrote it
         assert list(one.messages()) == list(two.messages())
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the packaged recording ``hand_stir``: a hand that dips, stirs and swipes a ball.
+"""Make the packaged recordings: a hand that stirs with a ball, and one that pushes with a box.
 
     python scenes/bags/make_hand_bag.py [FOLDER]
 
 No person was recorded. The motion is put together from what is known of hands: reaches of minimum
 jerk (Flash & Hogan 1985, The coordination of arm movements), the tremor of 8 to 12 Hz that every
 hand has, here below a millimetre, slow drift, and a tracker that jitters by milliseconds and once
-loses the marker for 0.3 s. It suits a ball of radius 0.03 m in a tank whose water fills
-[0, 0.2] x [0, 0.2] x [0, 0.1] m. The same code gives the same file.
+loses the marker for 0.3 s. The same code gives the same files.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,6 @@ TOPIC = "/hand/pose"
 FRAME = "world"
 START_NS = 1_700_000_000 * NANOSECONDS
 RATE = 60.0  # [Hz]
-SEED = 2009
-DROP_OUT = (7.1, 7.4)  # [s], in the middle of stirring
 # Angle by which a hand leans into its motion [rad per m/s].
 LEAN = 0.3
 
@@ -60,8 +58,25 @@ def stir(start: tuple, center: tuple, turns: float, bob: float = 0.0) -> Path3:
     return path
 
 
-def choreography() -> list[tuple[float, Path3]]:
-    """(duration [s], path) of every part, each starting where the last one ends."""
+class Recording(NamedTuple):
+    """What a hand does.
+
+    Attributes:
+        parts: (duration [s], path) one after the other, each starting where the last one ends.
+        drop_out: moment at which the marker is lost and when it is seen again [s].
+        seed: of tremor, drift and jitter.
+    """
+
+    parts: list[tuple[float, Path3]]
+    drop_out: tuple[float, float]
+    seed: int
+
+
+def hand_stir() -> Recording:
+    """Dips, stirs and swipes a ball of radius 0.03 m; water fills [0, 0.2] x [0, 0.2] x [0, 0.1] m.
+
+    The marker is lost in the middle of stirring.
+    """
     above, beside = (0.10, 0.10, 0.18), (0.135, 0.10, 0.06)
     left, right = (0.055, 0.10, 0.07), (0.145, 0.10, 0.07)
     front, back = (0.10, 0.055, 0.06), (0.10, 0.145, 0.06)
@@ -76,7 +91,28 @@ def choreography() -> list[tuple[float, Path3]]:
         (0.6, front), (0.3, back), (1.0, high), (0.45, deep), (0.4, None),  # and a plunge
         (1.2, above), (1.18, None),
     ]  # fmt: skip
-    parts, here = [], above
+    return Recording(joined(above, stations), (7.1, 7.4), 2009)
+
+
+def hand_push() -> Recording:
+    """Pushes a drop of radius 0.02 m at the origin with a box of 0.03 m that comes along x.
+
+    First gently, then with a jerk; the marker is lost while the box draws back.
+    """
+    away, into, behind = (0.05, 0.0, 0.0), (-0.005, 0.0, 0.0), (-0.07, 0.004, 0.0)
+    stations = [
+        (0.5, away), (0.7, into), (0.6, None), (0.9, away), (0.5, None),
+        (0.4, behind), (0.8, None), (1.2, (0.05, 0.01, 0.02)), (0.8, away), (0.6, None),
+    ]  # fmt: skip
+    return Recording(joined(away, stations), (2.1, 2.4), 2010)
+
+
+RECORDINGS = {"hand_stir": hand_stir, "hand_push": hand_push}
+
+
+def joined(start: tuple, stations: list) -> list[tuple[float, Path3]]:
+    """Parts through stations (duration [s], point to reach, path, or None to stay)."""
+    parts, here = [], start
     for duration, station in stations:
         if not callable(station):
             there = here if station is None else station
@@ -87,11 +123,11 @@ def choreography() -> list[tuple[float, Path3]]:
     return parts
 
 
-def intended_positions(times: np.ndarray) -> np.ndarray:
+def intended_positions(parts: list, times: np.ndarray) -> np.ndarray:
     """Where the hand wants to be, (N, 3) [m], at ``times`` (N,) [s] from the start."""
     positions = np.empty((len(times), 3))
     begin = 0.0
-    for duration, path in choreography():
+    for duration, path in parts:
         inside = times >= begin  # later parts overwrite their own share
         positions[inside] = path(np.clip((times[inside] - begin) / duration, 0.0, 1.0))
         begin += duration
@@ -114,35 +150,39 @@ def quaternions(rotation_vectors: np.ndarray) -> np.ndarray:
     return np.concatenate([0.5 * np.sinc(half / np.pi) * rotation_vectors, np.cos(half)], axis=1)
 
 
-def hand_motion() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def hand_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Stamps (N,), times of receipt (N,) [ns] from the start; positions (N, 3), quats (N, 4)."""
-    rng = np.random.default_rng(SEED)
-    duration = sum(part[0] for part in choreography())
+    rng = np.random.default_rng(recording.seed)
+    duration = sum(part[0] for part in recording.parts)
     times = np.arange(int(duration * RATE)) / RATE
     times[1:] += rng.uniform(-0.002, 0.002, len(times) - 1)
     delays = rng.uniform(0.002, 0.006, len(times))
-    positions = intended_positions(times)
+    positions = intended_positions(recording.parts, times)
     step = 1e-4
-    velocities = (intended_positions(times + step) - positions) / step
+    velocities = (intended_positions(recording.parts, times + step) - positions) / step
     positions += wobble(times, rng, (8.0, 12.0), 0.0005)  # tremor
     positions += wobble(times, rng, (0.05, 0.2), 0.002)  # drift
     leaning = LEAN * np.stack([-velocities[:, 1], velocities[:, 0], 0.0 * times], axis=1)
     rotations = quaternions(leaning + wobble(times, rng, (0.1, 0.5), 0.1))
-    seen = (times < DROP_OUT[0]) | (times > DROP_OUT[1])
+    lost, found = recording.drop_out
+    seen = (times < lost) | (times > found)
     stamps = np.round(times * 1e6).astype(np.int64) * 1000
     received = stamps + np.round(delays * 1e6).astype(np.int64) * 1000
     # Rounded to what a tracker resolves, so that another processor's last bit does not show.
     return stamps[seen], received[seen], positions.round(6)[seen], rotations.round(6)[seen]
 
 
-def write_hand_bag(folder: str | Path, overwrite: bool = False) -> None:
-    """Write the recording as a bag; BagError when one is there and not to be replaced."""
+def write_hand_bag(name: str, folder: str | Path, overwrite: bool = False) -> None:
+    """Write a recording as a bag; BagError when one is there and not to be replaced."""
     with BagWriter(folder, overwrite=overwrite) as bag:
-        for stamp, received, position, quat_xyzw in zip(*hand_motion(), strict=True):
+        for stamp, received, position, quat_xyzw in zip(
+            *hand_motion(RECORDINGS[name]()), strict=True
+        ):
             pose = pose_to_cdr(position, quat_xyzw, START_NS + int(stamp), FRAME)
             bag.write(TOPIC, POSE_STAMPED, START_NS + int(received), pose)
 
 
 if __name__ == "__main__":
-    target = sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent / "hand_stir"
-    write_hand_bag(target, overwrite=True)
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    for recording_name in RECORDINGS:
+        write_hand_bag(recording_name, target / recording_name, overwrite=True)
