@@ -187,7 +187,6 @@ def test_bad_calibrations_are_named_and_good_ones_follow(running, message, text,
 
     running.show_until(said)
     running.calibrate()
-    running.show_until(lambda: running.report()[0] == DiagnosticStatus.OK)
     assert is_near(running.pose_after(len(running.poses)), CENTRE)
 
 

@@ -231,6 +231,25 @@ def test_a_cube_is_followed_all_the_way_round():
     assert rms(off[:, :3]) < 0.003 and np.degrees(rms(off[:, 3:])) < 2.0
 
 
+def test_a_marker_seen_edge_on_comes_back():
+    """Turned until it is a line, and back: no wild pose on the way, the right one at the end."""
+    camera = SyntheticCamera(CAMERA, flaws=Flaws())
+    tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD))
+    angles = 1.5 * np.sin(np.linspace(0.0, np.pi, 60))  # the camera is 0.6 rad off on this side
+    places, off, seen = [], [], 0
+    for k, angle in enumerate(angles):
+        pose = Pose(exp(np.array([angle, 0.0, 0.0])), CENTRE.position)
+        picture = camera.take([(WORLD, CAMERA_FROM_WORLD), (BALL, CAMERA_FROM_WORLD @ pose)])
+        result = tracker.process(picture, round((k / FPS + 1) * 1e9), CAMERA)
+        seen += any(detection.id == 1 for detection in result.detections)
+        if result.solids["ball"].pose is not None:
+            places.append(result.solids["ball"].pose.position - CENTRE.position)
+            off = difference(result.solids["ball"].pose, pose)
+    assert 15 <= seen <= 55
+    assert np.linalg.norm(places, axis=1).max() < 0.02
+    assert np.linalg.norm(off[:3]) < 0.003 and np.degrees(np.linalg.norm(off[3:])) < 4.0
+
+
 def test_pictures_of_another_size_and_stragglers():
     tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD))
     empty = np.zeros((480, 640), np.uint8)

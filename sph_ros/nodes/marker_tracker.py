@@ -98,7 +98,7 @@ class MarkerTracker(Node):
         self._running = True
         self._thread = threading.Thread(target=self._work, name="tracker", daemon=True)
         self._thread.start()
-        where = parameters.source or f"{self._input_topics['image']} and {self._input_topics['camera_info']}"
+        where = parameters.source or self._input_topics["image"]
         self.get_logger().info(f"tracking {', '.join(names) or 'nothing'} in {where}")
 
     def destroy_node(self):

@@ -21,6 +21,11 @@ _STEPS = 17  # samples along a profile
 _WEAK = 0.25  # of a profile's steepest slope: less is noise
 _LEAST_CONTRAST = 4.0  # [grey values per pixel]
 _LEAST_SIDE = 8.0  # [pixels]
+_CENTRED = 0.4  # [pixels]
+
+_NEXT, _BEFORE, _OPPOSITE = [1, 2, 3, 0], [3, 0, 1, 2], [2, 3, 0, 1]
+_SHARES = np.linspace(*COVERED, SAMPLES)
+_PROFILE = np.linspace(-1.0, 1.0, _STEPS)
 
 
 def edge_corners(gray, corners, modules):
@@ -31,40 +36,41 @@ def edge_corners(gray, corners, modules):
         corners: (4, 2) good to a pixel or two, in OpenCV's order.
         modules: of the marker along a side, border included.
     """
-    for _ in range(2):  # the second time the profiles are centred on the edge
+    for _ in range(2):
         lines = _side_lines(gray, corners, modules)
-        if lines is None:
+        better = None if lines is None else _crossings(*lines)
+        if better is None:
             return None
-        corners = _crossings(*lines)
-        if corners is None:
-            return None
+        shift = float(np.abs(better - corners).max())
+        corners = better
+        if shift < _CENTRED:  # else the profiles were not centred on the edge: once more
+            break
     return corners
 
 
 def _side_lines(gray, corners, modules):
     """A point (4, 2) and a direction (4, 2) of the line through each side; None on failure."""
-    along = np.roll(corners, -1, axis=0) - corners
+    along = corners[_NEXT] - corners
     lengths = np.sqrt(np.sum(along**2, axis=1))
     if lengths.min() < _LEAST_SIDE:
         return None
     directions = along / lengths[:, None]
     outwards = np.column_stack([directions[:, 1], -directions[:, 0]])
     # Height of the marker over each side: it may be seen nearly edge-on.
-    opposite = np.roll(corners, -2, axis=0) - corners
+    opposite = corners[_OPPOSITE] - corners
     heights = -np.sum(opposite * outwards, axis=1)
     if heights.min() < modules:
         return None
     reach = np.clip(REACH_MODULES * heights / modules, *REACH)
-    shares = np.linspace(*COVERED, SAMPLES)
-    offsets = reach[:, None] * np.linspace(-1.0, 1.0, _STEPS)  # (4, K)
-    feet = corners[:, None] + shares[None, :, None] * along[:, None]  # (4, M, 2)
+    offsets = reach[:, None] * _PROFILE  # (4, K)
+    feet = corners[:, None] + _SHARES[None, :, None] * along[:, None]  # (4, M, 2)
     places = feet[:, :, None] + offsets[:, None, :, None] * outwards[:, None, None]
     places = places.astype(np.float32).reshape(4 * SAMPLES, _STEPS, 2)
     profiles = cv2.remap(gray, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     found, good = _step_offsets(profiles.reshape(4, SAMPLES, _STEPS).astype(float), offsets)
     if good.sum(axis=1).min() < SAMPLES // 3:
         return None
-    starts, slopes = _fit(shares, found, good)
+    starts, slopes = _fit(_SHARES, found, good)
     points = corners + starts[:, None] * outwards
     return points, along + slopes[:, None] * outwards
 
@@ -93,14 +99,15 @@ def _fit(shares, found, good):
         slopes = np.sum(weights * centred * (found - mean_found[:, None]), axis=1) / spread
         starts = mean_found - slopes * mean_share
         errors = np.abs(found - starts[:, None] - slopes[:, None] * shares)
-        limit = 2.5 * np.maximum(np.median(errors, axis=1), 0.05)
+        median = np.partition(errors, SAMPLES // 2, axis=1)[:, SAMPLES // 2]
+        limit = 2.5 * np.maximum(median, 0.05)
         good = good & (errors <= limit[:, None])
     return starts, slopes
 
 
 def _crossings(points, directions):
     """Corners (4, 2) where each side's line meets the one before; None for parallel lines."""
-    before, before_directions = np.roll(points, 1, axis=0), np.roll(directions, 1, axis=0)
+    before, before_directions = points[_BEFORE], directions[_BEFORE]
     gap = points - before
     cross = _cross(before_directions, directions)
     if np.abs(cross).min() < 1e-3 * np.abs(directions).max() ** 2:

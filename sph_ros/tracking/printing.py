@@ -16,7 +16,8 @@ WORLD_ID, SOLID_ID = 0, 1
 MARKER_SIZE = 80.0  # [mm], the tracker's default
 
 CUBE_IDS = (2, 3, 4, 5, 6, 7)  # top, front, right, back, left, bottom
-CUBE_EDGE, CUBE_MARKER = 45.0, 36.0  # [mm]
+#: [mm]. The margin is wide: OpenCV 4.6 takes the cube's own outline for the marker if it is near.
+CUBE_EDGE, CUBE_MARKER = 45.0, 30.0
 
 
 class CharucoBoard(NamedTuple):
