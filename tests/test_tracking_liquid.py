@@ -46,27 +46,29 @@ def tracked(times, truth, filter):
     return poses
 
 
-def particles_that_leave(times, poses):
-    """Run `drop_box`; ids of particles that are no longer connected with the drop at the end."""
+def pushed_drop(times, poses):
+    """Run `drop_box`; ids of particles no longer connected with the drop, and its centre [m]."""
     scene = load_scene("drop_box")
     sim = Simulation(scene)
     for time, pose in zip(times, poses, strict=True):
         if pose is not None:
             sim.move_solid("box", pose.position, pose.quat_xyzw, time=float(time))
     sim.advance(SECONDS)
-    pairs = cKDTree(sim.positions).sparse_distance_matrix(
-        cKDTree(sim.positions), 2.0 * scene.spacing
-    )
+    tree = cKDTree(sim.positions)
+    pairs = tree.sparse_distance_matrix(tree, 2.0 * scene.spacing)
     _, labels = connected_components(pairs)
-    return set(sim.ids[labels != np.bincount(labels).argmax()].tolist())
+    left = labels != np.bincount(labels).argmax()
+    return set(sim.ids[left].tolist()), sim.positions[~left].mean(axis=0)
 
 
 def test_no_particle_leaves_the_drop_that_stays_with_true_poses():
     times = np.arange(round(SECONDS * FPS)) / FPS
     truth = push(times)
-    with_truth = particles_that_leave(times, truth)
-    with_kalman = particles_that_leave(times, tracked(times, truth, "kalman"))
-    with_none = particles_that_leave(times, tracked(times, truth, "none"))
-    print(f"left: {len(with_truth)} true, {len(with_kalman)} filtered, {len(with_none)} unfiltered")
-    assert len(with_none) > 100  # the drop splatters
-    assert with_kalman <= with_truth
+    left, centre = pushed_drop(times, truth)
+    left_filtered, centre_filtered = pushed_drop(times, tracked(times, truth, "kalman"))
+    left_plain, centre_plain = pushed_drop(times, tracked(times, truth, "none"))
+    print(f"left: {len(left)} true, {len(left_filtered)} filtered, {len(left_plain)} unfiltered")
+    assert left_filtered <= left
+    assert np.linalg.norm(centre_filtered - centre) < 0.002
+    # The same pictures without filter throw the drop about.
+    assert left_plain - left or np.linalg.norm(centre_plain - centre) > 0.02

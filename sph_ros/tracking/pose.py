@@ -25,7 +25,7 @@ UNKNOWN = 1e-8
 
 
 #: Steps of Gauss and Newton towards the most probable pose.
-RELINEARIZATIONS = 3
+RELINEARIZATIONS = 2
 
 #: More squared error over variance [-] than the best fit has, and the prediction is not believed.
 MISFIT = 30.0

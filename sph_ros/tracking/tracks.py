@@ -169,12 +169,15 @@ class KalmanTrack(Track):
         if self._state is None:
             return self.restart(time, measurement)
         lost = self.age(time) > self.settings.lost_time
-        if not lost and surprise(self._predicted(time), measurement) <= self.settings.gate:
-            return self._update(time, measurement)
-        if not lost and self._last_was_wrong(time, measurement):
-            self._state, self.seen, _ = self._before
-            self._forget()
-            return self._update(time, measurement)
+        if not lost:
+            now = surprise(self._predicted(time), measurement)
+            if now <= self.settings.gate:
+                return self._update(time, measurement, now)
+            now = self._surprise_without_last(time, measurement)
+            if now is not None:
+                self._state, self.seen, _ = self._before
+                self._forget()
+                return self._update(time, measurement, now)
         return self._consider(time, measurement)
 
     def restart(self, time, measurement, rates=None):
@@ -192,10 +195,10 @@ class KalmanTrack(Track):
             self._means[time] = mean(self._predicted(time))
         return self._means[time]
 
-    def _update(self, time, measurement):
-        predicted = self._predicted(time)
-        self._before = (self._state, self.seen, surprise(predicted, measurement))
-        self._state, self.seen, self._candidates = update(predicted, measurement), time, []
+    def _update(self, time, measurement, its_surprise):
+        self._before = (self._state, self.seen, its_surprise)
+        updated = update(self._predicted(time), measurement)
+        self._state, self.seen, self._candidates = updated, time, []
         self._forget()
         return True
 
@@ -218,16 +221,17 @@ class KalmanTrack(Track):
         travel = settings.coast_time + settings.stop_time * (1.0 - left)
         return predict(state, elapsed, settings.motion, (travel, left))
 
-    def _last_was_wrong(self, time, measurement):
-        """Whether this one fits what was known before the last one better than the last one did.
+    def _surprise_without_last(self, time, measurement):
+        """Surprise when this one fits what was known before the last one better than that one did.
 
-        Then not this one but the last one was an outlier, although it had passed the gate.
+        Then not this one but the last one was an outlier, although it had passed the gate. Else
+        None.
         """
         if self._before is None:
-            return False
+            return None
         state, seen, last_surprise = self._before
         now = surprise(self._predict_from(state, time - seen), measurement)
-        return now < min(last_surprise, self.settings.gate)
+        return now if now < min(last_surprise, self.settings.gate) else None
 
     def _consider(self, time, measurement):
         """Keep a refused measurement; start over when enough of them agree."""
