@@ -58,15 +58,17 @@ test: $(READY)
 	$(BIN)/python -m pytest -q $(ARGS)
 
 bench: $(READY)
-	@for script in benchmarks/benchmark_*.py; do \
+	@for script in benchmarks/bench_*.py; do \
 	  echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit 1; \
 	done
 
-# Last picture and video of each scene, in out/.
+# The pictures of the README, last frames of offline runs; takes minutes.
 pictures: $(READY)
-	$(BIN)/sph_ros simulate ball_tank --bag hand_stir --out out/ball_tank --force
-	$(BIN)/sph_ros simulate dam_break --seconds 0.6 --out out/dam_break --force
-	$(BIN)/sph_ros simulate drop_box --seconds 1 --out out/drop_box --force
+	$(BIN)/sph_ros simulate ball_tank_large --bag hand_stir --seconds 17.1 --fps 10 --out out/ball_tank --force
+	$(BIN)/sph_ros simulate drop_box --bag hand_push --seconds 0.95 --fps 20 --out out/drop_box --force
+	$(BIN)/sph_ros simulate dam_break --seconds 0.5 --fps 20 --out out/dam_break --force
+	mkdir -p docs
+	for scene in ball_tank drop_box dam_break; do cp out/$$scene/last.png docs/$$scene.png || exit 1; done
 
 clean:
 	rm -rf $(VENV) build install log out *.egg-info .pytest_cache .ruff_cache
