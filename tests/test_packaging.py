@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from sph_ros.sim.materials import RANGES
+from sph_ros.sim.scene import list_scenes
 from sph_ros.sim.share import share_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,3 +93,22 @@ def test_the_code_finds_the_files_that_belong_to_it():
     folder = share_folder()
     assert (folder / "package.xml").is_file()
     assert (folder / "scenes" / "ball_tank.yaml").is_file()
+
+
+def test_the_readme_names_every_program_scene_and_parameter():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for program in PROGRAMS:
+        assert f"| `{program}" in readme, program
+    section = readme.partition("## Scenes")[2].partition("\n## ")[0]
+    listed = re.findall(r"^\| `(\w+)` \| [\d,]+ \|", section, re.MULTILINE)
+    assert sorted(listed) == list_scenes()
+    source = (ROOT / "sph_ros/nodes/parameters.py").read_text(encoding="utf-8")
+    declared = set(re.findall(r'(?:_declare|number)\(\s*"(\w+)"', source))
+    assert {"scene", "publish_rate", "smoothing_time"} <= declared
+    section = readme.partition("## Parameters of `fluid_node`")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\| ([^|]*) \|", section, re.MULTILINE)
+    assert {name for name, _ in rows} == declared | {f"material.{field}" for field in RANGES}
+    for field, (low, high) in RANGES.items():
+        assert dict(rows)[f"material.{field}"].replace(",", "") == f"{low:g} to {high:g}"
+    for picture in re.findall(r"\]\((docs/\w+\.png)\)", readme):
+        assert 10_000 < (ROOT / picture).stat().st_size < 400_000
