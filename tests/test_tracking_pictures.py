@@ -257,6 +257,8 @@ def test_pictures_of_another_size_and_stragglers():
     assert tracker.process(empty, 10**9, CAMERA) is None
     assert tracker.process(empty, 10**9 - 10**7, CAMERA) is None
     assert tracker.process(empty, 0, CAMERA) is not None  # a recording that starts over
+    again = [tracker.process(empty, 0, CAMERA) is not None for _ in range(3)]
+    assert again == [False, False, True]  # a short one
     with pytest.raises(ValueError, match="320 x 240"):
         tracker.process(np.zeros((240, 320), np.uint8), 2 * 10**9, CAMERA)
 

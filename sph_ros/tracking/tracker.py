@@ -20,6 +20,12 @@ from sph_ros.tracking.tracks import TrackSettings, make_track
 #: Stamps that jump back further [s] begin another recording; smaller ones are stragglers.
 RESTART_JUMP = 0.5
 
+#: So many pictures one after another that are not newer begin another recording, too.
+RESTART_COUNT = 3
+
+#: Pauses between pictures longer than this [s] say nothing about their rate.
+LONGEST_INTERVAL = 0.2
+
 #: A target that was lost so recently [s] is looked for in every picture.
 RECENTLY = 0.5
 
@@ -121,6 +127,8 @@ class Tracker:
     def reset(self):
         """Forget everything seen."""
         self._time = self._first_stamp = None
+        self._stragglers = 0
+        self._interval = 1.0 / 30.0  # between pictures [s]
         self._last_full = self._last_search = -math.inf
         self._followed = {
             t.name: _Followed(t, self.settings, bounded=t is not self.settings.world)
@@ -171,11 +179,14 @@ class Tracker:
             self._first_stamp = stamp_ns
         time = (stamp_ns - self._first_stamp) * 1e-9
         if self._time is not None and time <= self._time:
-            if self._time - time < RESTART_JUMP:
+            self._stragglers += 1
+            if self._time - time < RESTART_JUMP and self._stragglers < RESTART_COUNT:
                 return False
             self.reset()
             self._first_stamp, time = stamp_ns, 0.0
-        self._time = time
+        elif self._time is not None and time - self._time < LONGEST_INTERVAL:
+            self._interval = time - self._time
+        self._time, self._stragglers = time, 0
         return True
 
     # ---------------------------------------------------------------- where to look
@@ -184,24 +195,15 @@ class Tracker:
         """Regions of interest; None when the whole picture is to be searched."""
         settings, time = self.settings, self._time
         ages = [followed.track.age(time) for followed in self._followed.values()]
-        frame = self._frame_time()
-        missing = [age for age in ages if age > 1.5 * frame]
+        missing = [age for age in ages if age > 1.5 * self._interval]
         urgent = any(age < RECENTLY for age in missing)
-        due = time - self._last_search >= settings.search_interval - 0.5 * frame
+        due = time - self._last_search >= settings.search_interval - 0.5 * self._interval
         full = time - self._last_full >= settings.full_interval or urgent or (missing and due)
         regions = [] if full else self._predicted_regions(shape, camera)
         if full or not regions:
             self._last_full = self._last_search = time
             return None
         return merged_regions(regions)
-
-    def _frame_time(self):
-        """Usual time between pictures [s]."""
-        before = getattr(self, "_previous", None)
-        self._previous = self._time
-        if before is not None and 0.0 < self._time - before < 0.2:
-            self._interval = self._time - before
-        return getattr(self, "_interval", 1.0 / 30.0)
 
     def _predicted_regions(self, shape, camera):
         base = self._camera_from_world(self._time)

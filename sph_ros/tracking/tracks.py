@@ -12,7 +12,6 @@ import numpy as np
 
 from sph_ros.tracking.filter import (
     Estimate,
-    Measurement,
     MotionSettings,
     mean,
     predict,
@@ -278,7 +277,3 @@ def _still(pose, covariance):
     whole = np.zeros((12, 12))
     whole[:6, :6] = covariance
     return Estimate(pose, np.zeros(3), np.zeros(3), whole, np.ones(1))
-
-
-__all__ = ["FILTERS", "KalmanTrack", "Measurement", "OneEuroTrack", "PlainTrack", "TrackSettings",
-           "make_track", "smoothing_share"]  # fmt: skip
