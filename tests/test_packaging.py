@@ -106,9 +106,9 @@ def test_the_readme_names_every_program_scene_and_parameter():
     declared = set(re.findall(r'(?:_declare|number)\(\s*"(\w+)"', source))
     assert {"scene", "publish_rate", "smoothing_time"} <= declared
     section = readme.partition("## Parameters of `fluid_node`")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\| ([^|]*) \|", section, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", section, re.MULTILINE)
     assert {name for name, _ in rows} == declared | {f"material.{field}" for field in RANGES}
     for field, (low, high) in RANGES.items():
-        assert dict(rows)[f"material.{field}"].replace(",", "") == f"{low:g} to {high:g}"
+        assert dict(rows)[f"material.{field}"].strip().replace(",", "") == f"{low:g} to {high:g}"
     for picture in re.findall(r"\]\((docs/\w+\.png)\)", readme):
         assert 10_000 < (ROOT / picture).stat().st_size < 400_000
