@@ -18,7 +18,7 @@ REFINE_MODULES = 0.6
 MAX_REFINE_WINDOW = 6  # [pixels]
 
 #: A corner that refinement moves further [modules] has found something else.
-MAX_REFINE_SHIFT = 0.5
+MAX_REFINE_SHIFT, MAX_EDGE_SHIFT = 0.5, 0.7
 
 #: A region of interest reaches further than the marker by this share of its size.
 ROI_MARGIN = 0.6
@@ -114,7 +114,7 @@ class Detector:
     def _refined(self, gray, corners):
         """Corners to a fraction of a pixel; where that fails they stay as they are."""
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
-        allowed = max(2.0, MAX_REFINE_SHIFT * float(sides.mean()) / self._modules)
+        allowed = max(3.0, MAX_EDGE_SHIFT * float(sides.mean()) / self._modules)
         better = edge_corners(gray, corners, self._modules)
         if better is not None and float(np.abs(better - corners).max()) <= allowed:
             return better

@@ -22,6 +22,7 @@ _WEAK = 0.25  # of a profile's steepest slope: less is noise
 _LEAST_CONTRAST = 4.0  # [grey values per pixel]
 _LEAST_SIDE = 8.0  # [pixels]
 _CENTRED = 0.4  # [pixels]
+_PASSES = 5  # OpenCV's corners of an oblique marker can be four pixels off
 
 _NEXT, _BEFORE, _OPPOSITE = [1, 2, 3, 0], [3, 0, 1, 2], [2, 3, 0, 1]
 _SHARES = np.linspace(*COVERED, SAMPLES)
@@ -36,7 +37,7 @@ def edge_corners(gray, corners, modules):
         corners: (4, 2) good to a pixel or two, in OpenCV's order.
         modules: of the marker along a side, border included.
     """
-    for _ in range(2):
+    for _ in range(_PASSES):
         lines = _side_lines(gray, corners, modules)
         better = None if lines is None else _crossings(*lines)
         if better is None:
@@ -44,8 +45,8 @@ def edge_corners(gray, corners, modules):
         shift = float(np.abs(better - corners).max())
         corners = better
         if shift < _CENTRED:  # else the profiles were not centred on the edge: once more
-            break
-    return corners
+            return corners
+    return None
 
 
 def _side_lines(gray, corners, modules):
