@@ -42,23 +42,23 @@ def tell_while_waiting(tell, period=None):
 
 @contextmanager
 def preparing():
-    """Say on standard error that a program is at work before it has anything to show.
+    """Say on a terminal that a program is at work before it has anything to show.
 
-    A terminal gets one line that counts and vanishes, a log file a single line.
+    The line counts seconds and vanishes. Nothing is written to a file or a pipe, as progress bars
+    do it: there, standard error holds mistakes only.
     """
-    live, told = sys.stderr.isatty(), []
+    if not sys.stderr.isatty():
+        yield
+        return
+    told = []
 
     def tell(seconds):
-        text = f"preparing, the first run compiles for up to a minute ... {seconds:.0f} s"
-        if live:
-            print(f"\r{text}", end="", file=sys.stderr, flush=True)
-        elif not told:
-            print(text, file=sys.stderr, flush=True)
-        told.append(text)
+        told.append(f"preparing, the first run compiles for up to a minute ... {seconds:.0f} s")
+        print(f"\r{told[-1]}", end="", file=sys.stderr, flush=True)
 
     try:
         with tell_while_waiting(tell):
             yield
     finally:
-        if live and told:
+        if told:
             print(f"\r{' ' * len(told[-1])}\r", end="", file=sys.stderr, flush=True)
