@@ -136,7 +136,8 @@ def test_what_solids_push_the_liquid_loses():
         pushes = sum(sim.wrench(name)[0] for name in sim.solid_names)
         explained = (weight - pushes) * sim.time_step
         assert facts["squeezed_particles"] == 0
-        np.testing.assert_allclose(gained, explained, atol=1e-4 * np.abs(weight).sum())
+        # 4e-5 of the weight over a step; sums of 864 single precision velocities are no better.
+        np.testing.assert_allclose(gained, explained, atol=4e-5 * sim.time_step * abs(weight[2]))
 
 
 def test_a_ball_held_under_water_is_pushed_up_by_what_it_displaces():

@@ -116,6 +116,7 @@ def test_a_path_is_followed(sim):
         (("tank", [0, 0, 0]), ValueError, "fixed"),
         (("ball", [0, np.nan, 0]), ValueError, "ball: position"),
         (("ball", [0, 0]), ValueError, "three finite numbers"),
+        (("ball", [1e300, 0, 0]), ValueError, "up to 10000"),
         (("ball", [0, 0, 0], [0, 0, 0, 0]), ValueError, "length zero"),
         (("ball", [0, 0, 0], [0, 0, np.inf, 0]), ValueError, "four finite"),
         (("ball", [0, 0, 0], [0, 0, 0, 1], np.inf), ValueError, "time"),
@@ -173,12 +174,84 @@ def test_a_snapshot_goes_on_to_the_bit(sim, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
 
 
+def test_a_snapshot_keeps_the_step_and_the_last_wrench(sim, tmp_path):
+    sim.set_material(surface_tension=5.0)
+    sim.reset()
+    stir(sim, 10)
+    sim.save(tmp_path / "state.npz")
+    other = sph_ros.Simulation.load(tmp_path / "state.npz")
+    assert (other.time, other.time_step) == (sim.time, sim.time_step)
+    np.testing.assert_array_equal(other.wrench("tank"), sim.wrench("tank"))
+    mine, theirs = sim.statistics(), other.statistics()
+    assert all(np.array_equal(mine[key], theirs[key]) for key in mine)
+
+
+def test_arrays_of_the_caller_stay_the_callers(sim):
+    place = np.array([0.1, 0.1, 0.15])
+    sim.move_solid("ball", place)
+    place[:] = 9.0
+    sim.advance(0.2)
+    place[:] = 7.0
+    assert sim.solid("ball").position == pytest.approx([0.1, 0.1, 0.15])
+    with pytest.raises(ValueError, match="read-only"):
+        sim.solid("ball").position[0] = 1.0
+
+
+def test_an_endless_plane_that_tilts_far_from_its_origin_lets_nothing_in():
+    sim = sph_ros.Simulation(
+        {
+            "spacing": 0.02,
+            "material": "water",
+            "liquid": [{"box": {"min": [2.9, 0, 0.3], "max": [3.1, 0.1, 0.4]}}],
+            "solids": [{"name": "ground", "plane": {}, "control": "topic"}],
+        }
+    )
+    sim.move_solid("ground", [0, 0, 0], [0, -np.sin(0.15), 0, np.cos(0.15)], time=0.5)
+    while sim.time < 0.7:
+        sim.step()
+        assert sim.solid("ground").signed_distance(sim.positions).min() > -0.05 * 0.02
+    assert sim.statistics()["max_speed"] < 10.0
+
+
+def test_two_dimensions_keep_their_plane_whatever_the_poses():
+    sim = sph_ros.Simulation(
+        {
+            "spacing": 0.02,
+            "dimension": 2,
+            "gravity": [0, 3.0, -9.81],
+            "material": "water",
+            "liquid": [{"box": {"min": [0, -0.1, 0], "max": [0.4, 0.1, 0.2]}}],
+            "solids": [
+                {"name": "tank", "container": {"box": {"min": [0, -1, 0], "max": [0.4, 1, 0.6]}}},
+                {
+                    "name": "box",
+                    "box": {"size": [0.08, 2, 0.08]},
+                    "pose": {"position": [0.2, 0, 0.4]},
+                    "control": "topic",
+                },
+            ],
+        }
+    )
+    for step in range(60):
+        turn = [0.3 * np.sin(step), 0.5, 0.2, 1.0]
+        sim.move_solid("box", [0.2, 0.05, 0.4 - 0.005 * step], turn)
+        sim.step()
+        assert sim.solid("box").signed_distance(sim.positions).min() > -0.05 * 0.02
+    assert np.all(sim.positions[:, 1] == 0.0)
+
+
 def test_what_is_no_snapshot_is_refused(tmp_path):
     with pytest.raises(SnapshotError, match="no such file"):
         sph_ros.Simulation.load(tmp_path / "missing.npz")
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(SnapshotError, match="text.npz"):
         sph_ros.Simulation.load(tmp_path / "text.npz")
+    sph_ros.Simulation(SCENE).save(tmp_path / "whole.npz")
+    with np.load(tmp_path / "whole.npz") as whole:
+        arrays = dict(whole)
+    np.savez(tmp_path / "cut.npz", **{**arrays, "velocities": arrays["velocities"][:9]})
+    with pytest.raises(SnapshotError, match="velocities: expected float32"):
+        sph_ros.Simulation.load(tmp_path / "cut.npz")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(SnapshotError, match="other.npz"):
         sph_ros.Simulation.load(tmp_path / "other.npz")

@@ -9,6 +9,7 @@ differently and the result would depend on how the loop was split among threads.
 
 import hashlib
 import os
+import shutil
 from pathlib import Path
 
 # Threads that wait must sleep. A waiting thread that spins takes the processor from the very thread
@@ -16,48 +17,64 @@ from pathlib import Path
 # libgomp when it is loaded, at the first parallel call.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from numba import njit  # noqa: E402
-
-
-def _drop_stale_kernels():
-    """Delete cached kernels when any source beside this file has changed.
-
-    Numba looks only at the file of the cached function itself; a change in a function that it calls
-    from another file would go unnoticed.
-    """
-    folder = Path(__file__).parent
-    sources = sorted(folder.glob("*.py"))
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
-    mark = folder / "__pycache__" / "kernels.sha256"
-    try:
-        if mark.exists() and mark.read_text() == digest:
-            return
-        mark.parent.mkdir(exist_ok=True)
-        for pattern in ("*.nbi", "*.nbc"):
-            for stale in mark.parent.glob(pattern):
-                stale.unlink(missing_ok=True)
-        mark.write_text(digest)
-    except OSError:
-        return  # A folder that cannot be written holds no cache of ours.
-
-
-_drop_stale_kernels()
+from numba import config, njit  # noqa: E402
 
 FASTMATH = {"reassoc", "contract", "nsz"}
 
+#: Versions of this package whose compiled kernels are kept.
+KEPT_VERSIONS = 8
+
+
+def _cache_folder():
+    """Where compiled kernels are kept: a folder that belongs to exactly these sources.
+
+    Numba looks only at the file of the cached function itself; a change in a function that it calls
+    from another file would go unnoticed. So all sources with kernels name the folder. Those of the
+    last few versions stay, because other processes may be running them.
+    """
+    package = Path(__file__).parents[1]
+    sources = sorted([*package.glob("core/*.py"), *package.glob("render/*.py")])
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    base = config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    kernels = Path(base) / "sph_ros" / "kernels"
+    folder = kernels / digest[:16]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        folders = sorted(kernels.iterdir(), key=lambda path: path.stat().st_mtime)
+        for old in folders[:-KEPT_VERSIONS]:
+            if old != folder:
+                shutil.rmtree(old, ignore_errors=True)
+    except OSError:
+        pass  # numba then finds a place of its own, or none
+    return str(folder)
+
+
+def _compiler(**options):
+    """A decorator like njit with our policy, whose kernels are cached in our folder."""
+
+    def decorate(function):
+        before, config.CACHE_DIR = config.CACHE_DIR, _FOLDER
+        try:
+            return njit(fastmath=FASTMATH, cache=True, error_model="numpy", **options)(function)
+        finally:
+            config.CACHE_DIR = before
+
+    return decorate
+
+
+_FOLDER = _cache_folder()
+
 #: A small scalar function, meant to be inlined into the kernels that call it.
-device = njit(fastmath=FASTMATH, cache=True, error_model="numpy")
+device = _compiler()
 
 #: The same, always part of its caller's code: handing tuples of many arrays to a function that is
 #: really called counts references, which takes longer than the distance to a solid.
-inlined = njit(fastmath=FASTMATH, cache=True, error_model="numpy", forceinline=True)
+inlined = _compiler(forceinline=True)
 
 #: A loop over arrays on one thread; the GIL is released.
-kernel = njit(fastmath=FASTMATH, cache=True, error_model="numpy", nogil=True)
+kernel = _compiler(nogil=True)
 
 #: A loop over arrays spread over threads. Iteration i of `prange` may write row i only. Give arrays
 #: that are fields of a tuple a local name before the loop: numba loses direct writes to them inside
 #: `prange`.
-parallel_kernel = njit(
-    fastmath=FASTMATH, cache=True, error_model="numpy", nogil=True, parallel=True
-)
+parallel_kernel = _compiler(nogil=True, parallel=True)

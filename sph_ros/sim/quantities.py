@@ -92,7 +92,10 @@ def _number(name, value, limits):
     unit = "" if limits["unit"] == "1" else f" [{limits['unit']}]"
     if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
         raise ValueError(f"{name}: expected a number{unit}, got {value!r}")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ValueError(f"{name}: expected a finite number{unit}, got a larger one") from None
     if not math.isfinite(number) and not (limits["endless"] and number == math.inf):
         raise ValueError(f"{name}: expected a finite number{unit}, got {value!r}")
     low, high, above = limits["low"], limits["high"], limits["above"]

@@ -5,15 +5,12 @@ import math
 
 import numpy as np
 
-IDENTITY_XYZW = np.array([0.0, 0.0, 0.0, 1.0])
-
 
 def normalized(quat_xyzw):
     """The quaternion divided by its length.
 
     Raises:
-        ValueError: it is not four finite numbers, or its length is not even roughly one half or
-        more.
+        ValueError: it is not four finite numbers, or its length is zero.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     if quat.shape != (4,) or not np.all(np.isfinite(quat)):

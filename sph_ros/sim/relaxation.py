@@ -46,7 +46,9 @@ class RelaxationSolver:
         self._scene = scene
         self._solids = solids
         self._depth = depth
-        self._gravity = np.asarray(scene.gravity, np.float32)
+        self._gravity = np.array(scene.gravity, np.float32)
+        if scene.dimension == 2:
+            self._gravity[1] = 0.0
         self._h = np.float32(scene.support_radius)
         self._work = Workspace(0, len(solids))
         self._packing = packing(scene, 0.0)
@@ -66,12 +68,21 @@ class RelaxationSolver:
 
     def state(self):
         """What a later step depends on beside the fluid, for a snapshot."""
-        return {"fastest": self.fastest, "share": self._share, "packing": self._packing}
+        return {
+            "fastest": self.fastest,
+            "share": self._share,
+            "packing": self._packing,
+            "iterations": self.iterations,
+            "density_error": self.density_error,
+            "squeezed": self.squeezed,
+        }
 
     def set_state(self, state):
         """Inverse of `state`."""
         self.fastest, self._share = state["fastest"], state["share"]
         self._packing = state["packing"]
+        self.iterations, self.density_error = state["iterations"], state["density_error"]
+        self.squeezed = state["squeezed"]
 
     def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
@@ -321,7 +332,9 @@ class RelaxationSolver:
                 work.predicted,
                 work.contacts,
                 self._solids.motion,
-                np.float32(WALL_LAYERS * scales.viscous_rate * time_step),
+                np.float32(
+                    WALL_LAYERS * self._material.wall_friction * scales.viscous_rate * time_step
+                ),
                 np.float32(self._material.wall_friction * time_step / self._scene.spacing),
                 np.float32(scales.mass / time_step),
                 fluid.velocities,

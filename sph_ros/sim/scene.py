@@ -50,6 +50,10 @@ __all__ = [
     "scene_path",
 ]
 
+#: Liquid farther from the origin moves in steps that one sees: 6e-8 of the distance is 3e-4 of a
+#: spacing here.
+FARTHEST_SPACINGS = 5_000
+
 # ---------------------------------------------------------------- finding
 
 
@@ -305,6 +309,13 @@ def _check_solids(scene: Scene, root: Node) -> None:
     positions, _ = fill_liquid(scene)
     if scene.liquid and not len(positions):
         raise _item(root, "liquid", 0).error("holds no particle")
+    farthest = float(np.abs(positions).max(initial=0.0))
+    if farthest > FARTHEST_SPACINGS * scene.spacing:
+        raise _item(root, "liquid", 0).error(
+            f"lies {farthest:.4g} m from the origin, expected at most "
+            f"{FARTHEST_SPACINGS * scene.spacing:.4g} m ({FARTHEST_SPACINGS:,} spacings): "
+            "positions are single precision numbers"
+        )
     for index, solid in enumerate(scene.solids):
         node = _item(root, "solids", index)
         distance = _checked(node, lambda s=solid: distances_to(s.shape, s.pose, positions, scene))

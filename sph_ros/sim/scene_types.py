@@ -227,7 +227,7 @@ class Scene:
             raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
         if self.emitters and not EMITTERS_AVAILABLE:
             raise ValueError("emitters: no solver of this version emits particles yet")
-        if isinstance(self.dimension, bool) or self.dimension not in (2, 3):
+        if type(self.dimension) is not int or self.dimension not in (2, 3):
             raise ValueError(f"dimension: expected 2 or 3, got {self.dimension!r}")
         for key in ("name", "frame", "description"):
             if not isinstance(getattr(self, key), str):

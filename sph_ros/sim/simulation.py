@@ -12,8 +12,9 @@ from sph_ros.sim.relaxation import RelaxationSolver
 from sph_ros.sim.scales import liquid_depth, stable_time_step
 from sph_ros.sim.scene import load_scene
 from sph_ros.sim.scene_types import Scene
+from sph_ros.sim.shapes import Container
 from sph_ros.sim.snapshots import read_snapshot, write_snapshot
-from sph_ros.sim.solids import Solids, Waypoint, checked_pose
+from sph_ros.sim.solids import Solids
 from sph_ros.sim.state import Fluid
 
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
@@ -92,7 +93,7 @@ class Simulation:
         self._reactions[:] = 0.0
         for part in range(count):
             now = self.time + part * duration
-            self._solids.advance(now, duration, fastest)
+            self._solids.advance(now, duration, fastest, self._liquid_reach())
             self._reactions += self._solver.step(self._fluid, now, duration) / count
         self.timings = self._solver.timings
         self._substeps = count
@@ -102,7 +103,10 @@ class Simulation:
     def _substep_count(self):
         """Substeps that keep solids and particles within their reach, and the liquid stable."""
         dt = self.time_step
-        ahead = min(self._solids.distance_ahead(self.time, dt), self.scene.max_solid_speed * dt)
+        ahead = min(
+            self._solids.distance_ahead(self.time, dt, self._liquid_reach()),
+            self.scene.max_solid_speed * dt,
+        )
         particle = self._solver.fastest * dt
         wanted = max(
             ahead / (SOLID_REACH * self.scene.spacing),
@@ -110,6 +114,10 @@ class Simulation:
         )
         for_speed = min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
         return max(for_speed, math.ceil(dt / self._stable_step - 1e-6))
+
+    def _liquid_reach(self):
+        """Distance of the farthest particle from the origin of the world, at least [m]."""
+        return float(np.linalg.norm(np.abs(self._fluid.positions).max(axis=0, initial=0.0)))
 
     def advance(self, seconds):
         """Advance by whole steps until at least `seconds` [s] more are simulated."""
@@ -127,6 +135,9 @@ class Simulation:
         """Write the whole state to one file; `Simulation.load` goes on from it to the bit."""
         numbers = {
             "steps": self._steps,
+            "time_step": [self.time_step, self.time_step_reason],
+            "substeps": self._substeps,
+            "reactions": self._reactions.tolist(),
             "solver": self._solver.state(),
             "solids": {solid.name: solid.state() for solid in self._solids},
         }
@@ -147,6 +158,9 @@ class Simulation:
         simulation._use_material(material)
         simulation._solver.set_state(numbers["solver"])
         simulation._steps = numbers["steps"]
+        simulation.time_step, simulation.time_step_reason = numbers["time_step"]
+        simulation._substeps = numbers["substeps"]
+        simulation._reactions[:] = numbers["reactions"]
         for name, state in numbers["solids"].items():
             simulation._solids[name].set_state(state)
         simulation._solids.settle()
@@ -243,19 +257,19 @@ class Simulation:
         solid = self._solids[name]
         if solid.control == "fixed":
             raise ValueError(f"{name}: this solid is fixed; give it `control: topic` to move it")
-        place, quat = checked_pose(name, position, quat_xyzw)
         soonest = self.time + self.time_step
         if time is None or time < soonest:
             time = soonest
         elif not math.isfinite(time):
             raise ValueError(f"{name}: time: expected a finite number, got {time!r}")
-        solid.order(Waypoint(float(time), place, quat))
+        solid.order(float(time), position, quat_xyzw)
 
     def wrench(self, name):
         """Force and torque of the liquid on a solid, averaged over the last step.
 
         Momentum that the solid gave to the liquid in the step, per second and with the opposite
-        sign.
+        sign. Not booked are particles rescued from between solids (`squeezed_particles`) and
+        displacements cut at half a support radius: both happen only where solids crush liquid.
 
         Returns:
             force (3,) [N] and torque (3,) about the solid's origin [N m], world frame, float64. In
@@ -276,7 +290,7 @@ class Simulation:
         Returns:
             dict with time [s], particle_count, mean_compression and max_compression (density above
             rest over rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s],
-            lost_particles (those outside all closed containers or no longer finite),
+            lost_particles (those outside a container or no longer finite),
             squeezed_particles (rescued from between solids in the last step), substeps and
             iterations of the last step, density_error (mean, left by the last iteration, -). In 2D
             energies and momenta are per metre of depth.
@@ -304,7 +318,7 @@ class Simulation:
         """Particles that are outside some container by more than half a spacing, or not finite."""
         lost = ~np.isfinite(self._fluid.positions).all(axis=1)
         for solid in self._solids:
-            if type(solid.shape).__name__ == "Container":
+            if isinstance(solid.shape, Container):
                 distance = solid.signed_distance(self._fluid.positions)
                 lost |= distance < -0.5 * self.scene.spacing
         return int(lost.sum())

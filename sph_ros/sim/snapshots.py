@@ -77,6 +77,25 @@ def write_snapshot(path, scene, material, arrays, numbers):
         draft.unlink(missing_ok=True)
 
 
+def _check_arrays(path, arrays):
+    """Refuse arrays that are missing, cut off or of another kind."""
+    count = len(arrays["particle"])
+    wanted = {
+        "positions": ("float32", (count, 3)),
+        "velocities": ("float32", (count, 3)),
+        "pressures": ("float32", (count,)),
+        "densities": ("float32", (count,)),
+        "particle": ("int32", (count,)),
+        "ids": ("uint32", (count,)),
+    }
+    for name, (kind, shape) in wanted.items():
+        rows = arrays[name]
+        if rows.dtype != kind or rows.shape != shape:
+            raise SnapshotError(
+                f"{path}: {name}: expected {kind} {shape}, found {rows.dtype} {rows.shape}"
+            )
+
+
 def read_snapshot(path):
     """Scene, material, arrays and numbers of a snapshot.
 
@@ -87,6 +106,7 @@ def read_snapshot(path):
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         facts = json.loads(str(arrays.pop("facts")))
+        _check_arrays(path, arrays)
         if facts.pop("format") != FORMAT:
             raise SnapshotError(f"{path}: written by another version of sph_ros")
         return decode(facts.pop("scene")), decode(facts.pop("material")), arrays, facts

@@ -6,7 +6,6 @@ than the scene's `max_solid_speed`, and the liquid feels every substep of the wa
 jumps, flips or is lost for a while makes a quick push but no splash.
 """
 
-import math
 from collections import deque
 from typing import NamedTuple
 
@@ -26,19 +25,40 @@ class Waypoint(NamedTuple):
     quat_xyzw: np.ndarray
 
 
-def checked_pose(name, position, quat_xyzw):
-    """Position and unit quaternion as float64 arrays.
+#: Poses farther from the origin than this are a mistake [m].
+FARTHEST = 1e4
+
+
+def checked_pose(name, position, quat_xyzw, dimension=3):
+    """Position and unit quaternion as float64 arrays of their own, read-only.
+
+    Args:
+        name: of the solid, for messages.
+        position: [m], (3,).
+        quat_xyzw: normalised here.
+        dimension: in 2D a pose is reduced to what keeps the plane: y is 0, turns are about y.
 
     Raises:
-        ValueError: a value is not finite, a shape is wrong, or the quaternion is zero.
+        ValueError: a value is not finite or absurd, a shape is wrong, or the quaternion is zero.
     """
-    place = np.asarray(position, dtype=np.float64)
-    if place.shape != (3,) or not np.all(np.isfinite(place)):
-        raise ValueError(f"{name}: position: expected three finite numbers [m], got {position!r}")
+    place = np.array(position, dtype=np.float64)
+    if place.shape != (3,) or not np.all(np.abs(place) <= FARTHEST):
+        raise ValueError(
+            f"{name}: position: expected three finite numbers [m] up to {FARTHEST:g}, "
+            f"got {position!r}"
+        )
     try:
-        return place, quaternions.normalized(quat_xyzw)
+        quat = quaternions.normalized(quat_xyzw)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
+    if dimension == 2:
+        about_y = np.array([0.0, quat[1], 0.0, quat[3]])
+        upright = np.linalg.norm(about_y) < 1e-6
+        quat = quaternions.normalized([0.0, 0.0, 0.0, 1.0] if upright else about_y)
+        place[1] = 0.0
+    place.setflags(write=False)
+    quat.setflags(write=False)
+    return place, quat
 
 
 class Solid:
@@ -51,8 +71,8 @@ class Solid:
         velocity, angular_velocity: world frame [m/s], [rad/s], (3,), over the last substep.
     """
 
-    def __init__(self, spec, packed, index, reach):
-        """Args: the scene's SolidSpec, packed shapes, index among them, largest radius [m]."""
+    def __init__(self, spec, packed, index, dimension):
+        """Args: the scene's SolidSpec, packed shapes, index among them, 2 or 3."""
         self.name = spec.name
         self.control = spec.control
         self.shape = spec.shape
@@ -60,18 +80,23 @@ class Solid:
         self._spec = spec
         self._packed = packed
         self._index = index
-        self._reach = reach
+        self._dimension = dimension
+        #: How far material reaches from the origin [m]; infinite for planes and containers.
+        self.reach = bounding_radius(spec.shape)
         self.reset()
 
     def reset(self):
         """Back to the pose and the path of the scene."""
         self.position, self.quat_xyzw = checked_pose(
-            self.name, self._spec.pose.position, self._spec.pose.quat_xyzw
+            self.name, self._spec.pose.position, self._spec.pose.quat_xyzw, self._dimension
         )
         self.velocity = np.zeros(3)
         self.angular_velocity = np.zeros(3)
         self._waypoints = deque(
-            Waypoint(frame.time, *checked_pose(self.name, frame.position, frame.quat_xyzw))
+            Waypoint(
+                frame.time,
+                *checked_pose(self.name, frame.position, frame.quat_xyzw, self._dimension),
+            )
             for frame in self._spec.path
         )
 
@@ -89,12 +114,13 @@ class Solid:
 
     def set_state(self, state):
         """Inverse of `state`."""
-        self.position = np.array(state["position"])
-        self.quat_xyzw = np.array(state["quat_xyzw"])
+        self.position, self.quat_xyzw = checked_pose(
+            self.name, state["position"], state["quat_xyzw"]
+        )
         self.velocity = np.array(state["velocity"])
         self.angular_velocity = np.array(state["angular_velocity"])
         self._waypoints = deque(
-            Waypoint(time, np.array(position), np.array(quat))
+            Waypoint(time, *checked_pose(self.name, position, quat))
             for time, position, quat in state["waypoints"]
         )
 
@@ -119,22 +145,44 @@ class Solid:
         )
         return distance
 
-    def order(self, waypoint):
-        """Add a pose to reach. One that is not later than those known replaces them."""
+    def order(self, time, position, quat_xyzw):
+        """Add a pose to reach. One that is not later than those known replaces them.
+
+        Raises:
+            ValueError: as `checked_pose`.
+        """
+        waypoint = Waypoint(time, *checked_pose(self.name, position, quat_xyzw, self._dimension))
         while self._waypoints and self._waypoints[-1].time >= waypoint.time:
             self._waypoints.pop()
         self._waypoints.append(waypoint)
 
-    def distance_ahead(self, now, duration):
-        """How far a point of the solid would move in the next `duration` [s] without limit [m]."""
+    def distance_ahead(self, now, duration, liquid_reach):
+        """How far a point of the solid would move in the next `duration` [s] without limit [m].
+
+        Args:
+            now: simulated time [s].
+            duration: [s].
+            liquid_reach: distance of the farthest particle from the world's origin [m]; what is
+                farther of an endless solid moves nothing.
+        """
         position, quat = self._wanted(now, now + duration)
         turn = quaternions.between(self.quat_xyzw, quat)
-        return float(np.linalg.norm(position - self.position)) + self._reach * float(
+        return float(np.linalg.norm(position - self.position)) + self._lever(liquid_reach) * float(
             np.linalg.norm(turn)
         )
 
-    def advance(self, now, duration, max_speed):
+    def _lever(self, liquid_reach):
+        """Distance from the origin up to which turning matters [m]."""
+        return min(self.reach, liquid_reach + float(np.linalg.norm(self.position)))
+
+    def advance(self, now, duration, max_speed, liquid_reach):
         """Move on for `duration` [s] from `now`, no point of it faster than `max_speed` [m/s].
+
+        Args:
+            now: simulated time [s].
+            duration: [s].
+            max_speed: [m/s].
+            liquid_reach: as in `distance_ahead`.
 
         Returns:
             The farthest that a point of it moved [m].
@@ -142,13 +190,16 @@ class Solid:
         position, quat = self._wanted(now, now + duration)
         shift = position - self.position
         turn = quaternions.between(self.quat_xyzw, quat)
-        way = float(np.linalg.norm(shift)) + self._reach * float(np.linalg.norm(turn))
+        way = float(np.linalg.norm(shift)) + self._lever(liquid_reach) * float(np.linalg.norm(turn))
         share = min(1.0, max_speed * duration / way) if way > 0.0 else 1.0
         if share == 1.0:
             self.position, self.quat_xyzw = position, quat
         else:
-            self.position = self.position + share * shift
-            self.quat_xyzw = quaternions.turned(self.quat_xyzw, share * turn)
+            self.position, self.quat_xyzw = checked_pose(
+                self.name,
+                self.position + share * shift,
+                quaternions.turned(self.quat_xyzw, share * turn),
+            )
         self.velocity = share * shift / duration
         self.angular_velocity = share * turn / duration
         end = now + duration
@@ -195,7 +246,7 @@ class Solids:
             scene.dimension,
         )
         self._solids = {
-            spec.name: Solid(spec, self.packed, index, self._turning_radius(spec.shape))
+            spec.name: Solid(spec, self.packed, index, scene.dimension)
             for index, spec in enumerate(specs)
         }
         count = len(specs)
@@ -206,12 +257,6 @@ class Solids:
             np.zeros((count, 3, 3), np.float32),
         )
         self.reset()
-
-    @staticmethod
-    def _turning_radius(shape):
-        """Radius in which turning moves material; unbounded shapes count as a metre."""
-        radius = bounding_radius(shape)
-        return radius if math.isfinite(radius) else 1.0
 
     def __iter__(self):
         """Over the solids, in the scene's order."""
@@ -250,18 +295,21 @@ class Solids:
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
 
-    def distance_ahead(self, now, duration):
+    def distance_ahead(self, now, duration, liquid_reach):
         """The farthest that a point of any solid would move in the next `duration` [s] [m]."""
-        return max((solid.distance_ahead(now, duration) for solid in self), default=0.0)
+        return max(
+            (solid.distance_ahead(now, duration, liquid_reach) for solid in self), default=0.0
+        )
 
-    def advance(self, now, duration, max_speed):
-        """Move all solids on for `duration` [s]."""
+    def advance(self, now, duration, max_speed, liquid_reach):
+        """Move all solids on for `duration` [s]; arguments as for one `Solid`."""
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
         self.travel = 0.0
         for solid in self:
             if solid.control != "fixed":
-                self.travel = max(self.travel, solid.advance(now, duration, max_speed))
+                way = solid.advance(now, duration, max_speed, liquid_reach)
+                self.travel = max(self.travel, way)
         self._write_poses(self.motion.position, self.motion.rotation)
 
     def _write_poses(self, position, rotation):
