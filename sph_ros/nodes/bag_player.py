@@ -33,6 +33,8 @@ from sph_ros.options import not_negative, positive, remapping
 PUBLISHER_DEPTH = 100
 CLOCK_TOPIC = "/clock"
 DEFAULT_CLOCK_RATE = 100.0  # [Hz]
+#: Between two laps of a loop, at least; a bag may hold one message only.
+LEAST_LAP_GAP = 0.01  # [s]
 
 
 class BagPlayer(Node):
@@ -76,23 +78,28 @@ class BagPlayer(Node):
             f"playing {count} messages of {', '.join(self._message_publishers)} "
             f"at rate {self._options.rate:g}{', for ever' if self._options.loop else ''}"
         )
-        self._play_once()
+        length, played = self._play_once()
         while self._options.loop:
-            self._play_once()
+            # The next lap begins one message later, not at the very moment of the last one.
+            self._spin_until(time.monotonic() + max(LEAST_LAP_GAP, length / max(played - 1, 1)))
+            length, played = self._play_once()
         self._wait_for_delivery()
         self.get_logger().info("played to the end")
 
-    def _play_once(self) -> None:
+    def _play_once(self) -> tuple[float, int]:
+        """Play all messages; returns how long that took [s] and how many there were."""
         messages: Iterable[BagMessage] = self._bag.messages(list(self._message_publishers))
         if self._clock_publisher is not None:
             period = self._options.rate / self._options.clock * NANOSECONDS
             messages = with_clock(messages, max(1, round(period)))
-        began, first_ns = time.monotonic(), None
+        began, first_ns, count = time.monotonic(), None, 0
         for message in messages:
             first_ns = message.stamp_ns if first_ns is None else first_ns
             elapsed = (message.stamp_ns - first_ns) / NANOSECONDS / self._options.rate
             self._spin_until(began + elapsed)
             self._publish(message)
+            count += 1
+        return time.monotonic() - began, count
 
     def _publish(self, message: BagMessage) -> None:
         if message.topic == CLOCK_TOPIC and self._clock_publisher is not None:
@@ -112,9 +119,9 @@ class BagPlayer(Node):
             if not self.context.ok():
                 raise ExternalShutdownException
             remaining = deadline - time.monotonic()
+            self._executor.spin_once(timeout_sec=min(max(remaining, 0.0), 0.2))
             if remaining <= 0.0:
                 return
-            self._executor.spin_once(timeout_sec=min(remaining, 0.2))
 
     def _wait_for_subscriber(self) -> None:
         deadline = time.monotonic() + self._options.wait

@@ -120,7 +120,7 @@ class ThreadDriver:
         self.paused = False
         self.publish_period, self.surface_period = 1.0 / 30.0, 1.0 / 15.0
         self.smoothing_time = 0.0
-        self._orders, self._calls = deque(), deque()
+        self._orders, self._calls = {}, deque()
         self._wake, self._stopping = threading.Event(), False
         self._changed, self._next_publish, self._next_surface = True, 0.0, 0.0
         self._last_publish = 0.0
@@ -141,9 +141,12 @@ class ThreadDriver:
             self._calls.popleft()[1].cancel()
 
     def order(self, order):
-        """A pose message came; None when it was refused. Applied before the next step."""
+        """A pose message came; None when it was refused. Applied before the next step.
+
+        Only the newest of each solid waits, however long there is no step.
+        """
         if order is not None:
-            self._orders.append(order)
+            self._orders[order.solid] = order
 
     def call(self, function):
         """Have `function` run between two steps; returns a concurrent.futures.Future."""
@@ -235,7 +238,7 @@ class ThreadDriver:
 
     def _apply_orders(self):
         while self._orders:
-            order = self._orders.popleft()
+            _, order = self._orders.popitem()
             # The solid needs as long as the hand did, in simulated time.
             self._runner.move(order, min(order.interval * self._pace, self.smoothing_time))
 

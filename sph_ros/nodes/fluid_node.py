@@ -183,6 +183,7 @@ class FluidNode(Node):
         driver.smoothing_time = settings["smoothing_time"]
         if self._step_mode != "lockstep":
             self._schedule.max_catch_up = settings["max_catch_up"]
+        if self._step_mode == "realtime":
             self._schedule.speed = settings["speed"]
         if names is not None and any(name.startswith(MATERIAL_PREFIX) for name in names):
             material = settings.material()

@@ -66,7 +66,8 @@ class PoseGate:
     def __init__(self, solid, frame, transform=None):
         self.solid = solid
         self.accepted = 0
-        self.refused = Counter()
+        # All reasons from the start: other threads go through them while one counts.
+        self.refused = Counter(dict.fromkeys(REASONS, 0))
         self._frame = frame
         self._transform = transform
         self._arrival = None
