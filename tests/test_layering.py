@@ -15,6 +15,7 @@ FORBIDDEN = {
     "sph_ros/core": ("sph_ros.sim", "sph_ros.nodes", "sph_ros.render", "msg_adapters", "rclpy"),
     "sph_ros/sim": ("sph_ros.nodes", "sph_ros.render", "msg_adapters", "rclpy"),
     "sph_ros/render": ("sph_ros.nodes", "rclpy"),
+    "sph_ros/tracking": ("sph_ros.nodes", "rclpy"),
     "msg_adapters": ("sph_ros",),
 }
 
