@@ -105,8 +105,10 @@ def _parse(argv):
 
 def _run(options):
     from sph_ros.sim.scene import load_scene
+    from sph_ros.waiting import preparing
 
-    scene = load_scene(options.scene)
+    with preparing():
+        scene = load_scene(options.scene)
     hand = None if options.mouse else _hand(scene, options.bag)
     if options.headless:
         return _record(options, scene, hand)

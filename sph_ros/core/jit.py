@@ -34,7 +34,8 @@ def _cache_folder():
     """
     package = Path(__file__).parents[1]
     sources = sorted([*package.glob("core/*.py"), *package.glob("render/*.py")])
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    texts = [str(package).encode(), *(path.read_bytes() for path in sources)]
+    digest = hashlib.sha256(b"".join(texts)).hexdigest()
     base = config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     kernels = Path(base) / "sph_ros" / "kernels"
     folder = kernels / digest[:16]
@@ -53,7 +54,7 @@ def _compiler(**options):
     """A decorator like njit with our policy, whose kernels are cached in our folder."""
 
     def decorate(function):
-        before, config.CACHE_DIR = config.CACHE_DIR, _FOLDER
+        before, config.CACHE_DIR = config.CACHE_DIR, KERNELS
         try:
             return njit(fastmath=FASTMATH, cache=True, error_model="numpy", **options)(function)
         finally:
@@ -62,7 +63,8 @@ def _compiler(**options):
     return decorate
 
 
-_FOLDER = _cache_folder()
+#: Folder of the compiled kernels of these sources in this place.
+KERNELS = _cache_folder()
 
 #: A small scalar function, meant to be inlined into the kernels that call it.
 device = _compiler()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import (
     BYTES_PER_PARTICLE,
     available_memory,
@@ -306,6 +307,7 @@ def _check_amount(scene: Scene, root: Node) -> None:
 
 def _check_solids(scene: Scene, root: Node) -> None:
     """Refuse meshes that cannot be used, and liquid that starts inside a solid."""
+    ensure_compiled()
     positions, _ = fill_liquid(scene)
     if scene.liquid and not len(positions):
         raise _item(root, "liquid", 0).error("holds no particle")

@@ -6,6 +6,7 @@ import math
 import numpy as np
 
 from sph_ros.core.surface import extract_surface
+from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import fill_liquid
 from sph_ros.sim.materials import changed
 from sph_ros.sim.relaxation import RelaxationSolver
@@ -44,6 +45,7 @@ class Simulation:
         Raises:
             SceneError: something in the scene is wrong.
         """
+        ensure_compiled()
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.material = self.scene.material
         self._solids = Solids(self.scene)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compile all kernels once, in a process of its own.
+
+The process that compiles a kernel runs another machine code of it than processes that load it from
+numba's cache: linked functions are optimised once more for the cache, and sums may then be taken in
+another order. Both are right, but their last bits differ. So no process that simulates compiles:
+the first one has a child do it, and then loads what all later ones load.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from numba import config
+
+from sph_ros.core.jit import KERNELS
+
+#: Set for the child, which must not have children of its own.
+COMPILING = "SPH_ROS_COMPILING"
+
+LONGEST = 900.0  # [s]
+
+_SCENE = {
+    "spacing": 0.02,
+    "material": "honey",
+    "liquid": [{"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}}],
+    "solids": [
+        {"name": "tank", "container": {"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.3]}}},
+        {
+            "name": "ball",
+            "sphere": {"radius": 0.02},
+            "pose": {"position": [0.05, 0.05, 0.2]},
+            "control": "topic",
+        },
+    ],
+}
+
+
+def ensure_compiled():
+    """Have all kernels compiled if they are not yet; half a minute then, a moment otherwise.
+
+    Where that fails, say because nothing can be cached, this process compiles for itself.
+    """
+    mark = Path(KERNELS) / "complete"
+    if config.DISABLE_JIT or COMPILING in os.environ or mark.exists():
+        return
+    command = [sys.executable, "-m", "sph_ros.sim.kernels"]
+    root = str(Path(__file__).parents[2])
+    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, COMPILING: "1", "PYTHONPATH": os.pathsep.join(paths)}
+    try:
+        subprocess.run(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=LONGEST,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return
+
+
+def main():
+    """Take every way through the kernels once, then leave the mark."""
+    from sph_ros.sim.simulation import Simulation
+
+    for dimension in (3, 2):
+        simulation = Simulation({**_SCENE, "dimension": dimension})
+        simulation.move_solid("ball", [0.05, 0.05, 0.08])
+        simulation.step()
+        simulation.set_material(viscosity=0.001)
+        simulation.step()
+        simulation.statistics()
+        simulation.surface()
+    Path(KERNELS, "complete").touch()
+
+
+if __name__ == "__main__":
+    main()
