@@ -68,7 +68,7 @@ def test_no_film_is_left_by_an_error(tmp_path):
 def test_markers_show_visible_solids_where_they_are():
     sim = Simulation(FLAT)
     solids, colors = SolidMarkers(sim), solid_colors(sim.scene)
-    sim.solid("red").position[:] = (1.0, 2.0, 3.0)
+    sim.solid("red").position = np.array((1.0, 2.0, 3.0))
     markers = {marker.namespace: marker for marker in solids.at(77)}
     assert list(markers) == ["floor", "red", "plain"]
     assert markers["red"].position == (1.0, 2.0, 3.0) and markers["red"].color == (1, 0, 0, 1)
