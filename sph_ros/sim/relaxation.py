@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relaxation solver: the order of a step."""
 
-import time
-
 import numpy as np
 
 from sph_ros.core import contacts as touch
@@ -10,16 +8,13 @@ from sph_ros.core import neighbors as search
 from sph_ros.core import relaxation as relax
 from sph_ros.core.weights import DENSITY_POWER
 from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
-from sph_ros.sim.scales import packing, solver_scales
-from sph_ros.sim.state import Workspace, make_grid
+from sph_ros.sim.scales import packing, solver_scales, stable_time_step
+from sph_ros.sim.solver import Solver
 from sph_ros.sim.viscosity import apply_viscosity
 
 #: Pressure iterations end when the mean density error is below this share of the allowed
 #: compression. Looser, the errors keep a tank at rest in motion.
 TOLERANCE = 0.02
-
-#: Distance that particles keep from solids, as a share of the spacing.
-MARGIN = 0.05
 
 #: Viscosity between liquid and a solid that fills the support, as a multiple of that of one
 #: neighbour: (1 - r/h) summed over the layers of the lattice in its place, a third of it along the
@@ -27,62 +22,32 @@ MARGIN = 0.05
 WALL_LAYERS = 10.0
 
 
-class UnstableError(RuntimeError):
-    """A position or velocity is no longer a number."""
-
-
-class RelaxationSolver:
-    """Clavet's double density relaxation with the pressure solved implicitly.
-
-    Attributes:
-        scales: the numbers of the material.
-        iterations: pressure iterations of the last substep.
-        density_error: mean density error left in the last substep [-].
-        timings: milliseconds of the last step by part.
-    """
+class RelaxationSolver(Solver):
+    """Clavet's double density relaxation with the pressure solved implicitly."""
 
     def __init__(self, scene, solids, depth):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
-        self._scene = scene
-        self._solids = solids
-        self._depth = depth
-        self._gravity = np.array(scene.gravity, np.float32)
-        if scene.dimension == 2:
-            self._gravity[1] = 0.0
-        self._h = np.float32(scene.support_radius)
-        self._work = Workspace(0, len(solids))
+        super().__init__(scene, solids, depth)
         self._packing = packing(scene, 0.0)
         self._share = FIRST_SHARE
-        self._listed = None
-        self.set_material(scene.material)
-        self.iterations = 0
-        self.density_error = 0.0
-        self.fastest = 0.0
-        self.squeezed = 0
-        self.timings = {}
 
     def set_material(self, material):
         """Use another material from the next substep on."""
         self._material = material
         self.scales = solver_scales(material, self._scene, self._depth)
 
+    def stable_time_step(self):
+        """A step that keeps the scene stable [s], and what bounds it."""
+        return stable_time_step(self._scene, self.scales, self._depth)
+
     def state(self):
         """What a later step depends on beside the fluid, for a snapshot."""
-        return {
-            "fastest": self.fastest,
-            "share": self._share,
-            "packing": self._packing,
-            "iterations": self.iterations,
-            "density_error": self.density_error,
-            "squeezed": self.squeezed,
-        }
+        return {**super().state(), "share": self._share, "packing": self._packing}
 
     def set_state(self, state):
         """Inverse of `state`."""
-        self.fastest, self._share = state["fastest"], state["share"]
-        self._packing = state["packing"]
-        self.iterations, self.density_error = state["iterations"], state["density_error"]
-        self.squeezed = state["squeezed"]
+        super().set_state(state)
+        self._share, self._packing = state["share"], state["packing"]
 
     def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
@@ -154,43 +119,6 @@ class RelaxationSolver:
         self._find_neighbors()
         self._listed = fluid
 
-    def _prepare(self, fluid):
-        """Scratch memory that fits, and its running totals at zero."""
-        if self._work.count != len(fluid):
-            self._work = Workspace(len(fluid), len(self._solids))
-        self._work.reactions[:] = 0.0
-
-    def _clock(self, part):
-        now = time.perf_counter()
-        if part == "start":
-            self._passed = now
-            return
-        self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
-        self._passed = now
-
-    def _keep_outside(self, starts, ends, origins, travel, motion, time_step):
-        work = self._work
-        scene = self._scene
-        if not len(self._solids):
-            return
-        work.squeezed[:] = 0
-        touch.keep_outside(
-            starts,
-            ends,
-            origins,
-            work.clearance,
-            np.float32(travel),
-            self._solids.packed,
-            motion,
-            np.float32(MARGIN * scene.spacing),
-            np.float32(scene.spacing),
-            scene.dimension == 2,
-            np.float32(self.scales.mass / time_step**2),
-            work.reactions,
-            work.squeezed,
-        )
-        self.squeezed += int(work.squeezed.sum())
-
     def _predict(self, fluid, time_step):
         """Move on with gravity; what would pass into a solid stops at it."""
         work = self._work
@@ -206,45 +134,6 @@ class RelaxationSolver:
         self._keep_outside(
             fluid.positions, work.predicted, work.starts, travel, self._solids.motion, time_step
         )
-
-    def _grid(self):
-        lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
-        bad = search.bounding_box(self._work.predicted, lower, upper)
-        if bad >= 0:
-            raise UnstableError(f"row {bad}: its position is {self._work.predicted[bad]}")
-        return make_grid(lower, upper, float(self._h), self._work.count)
-
-    def _sort(self, fluid):
-        """Order all rows by cell of the predicted positions."""
-        work = self._work
-        self._grid_now = grid = self._grid()
-        search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
-        search.gather_rows(work.order, work.starts, fluid.positions)
-        search.gather_rows(work.order, work.predicted, work.scratch)
-        work.predicted, work.scratch = work.scratch, work.predicted
-        fluid.pressures = fluid.pressures[work.order]
-        fluid.particle = fluid.particle[work.order]
-        work.clearance = work.clearance[work.order]
-
-    def _find_contacts(self, time_step, clearance):
-        work = self._work
-        if len(self._solids):
-            touch.find_contacts(
-                work.predicted,
-                clearance,
-                self._solids.packed,
-                self._solids.motion,
-                np.float32(1.0 / time_step),
-                np.float32(self._packing),
-                work.chunks,
-                work.contacts,
-            )
-
-    def _find_neighbors(self):
-        work = self._work
-        search.transpose(work.predicted, work.columns)
-        while search.find_neighbors(work.columns, self._grid_now, self._h, work.chunks, work.pairs):
-            work.enlarge_pairs()
 
     def _sum_densities(self):
         work = self._work

@@ -9,13 +9,13 @@ from sph_ros.core.surface import extract_surface
 from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import fill_liquid
 from sph_ros.sim.materials import changed
-from sph_ros.sim.relaxation import RelaxationSolver
-from sph_ros.sim.scales import liquid_depth, stable_time_step
+from sph_ros.sim.scales import liquid_depth
 from sph_ros.sim.scene import load_scene
 from sph_ros.sim.scene_types import Scene
 from sph_ros.sim.shapes import Container
 from sph_ros.sim.snapshots import read_snapshot, write_snapshot
 from sph_ros.sim.solids import Solids
+from sph_ros.sim.solvers import SOLVER_CLASSES
 from sph_ros.sim.state import Fluid
 
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
@@ -54,9 +54,9 @@ class Simulation:
     def _start(self):
         """First state: the liquid of the scene, solids at their first poses."""
         positions, velocities = fill_liquid(self.scene)
-        self._depth = liquid_depth(self.scene, positions)
+        depth = liquid_depth(self.scene, positions)
         self._fluid = Fluid(positions, velocities)
-        self._solver = RelaxationSolver(self.scene, self._solids, self._depth)
+        self._solver = SOLVER_CLASSES[self.scene.solver](self.scene, self._solids, depth)
         self._use_material(self.material)
         self.time_step, self.time_step_reason = self._choose_time_step()
         self._steps = 0
@@ -69,13 +69,13 @@ class Simulation:
         """The scene's time step, or one that keeps it stable, and why."""
         if self.scene.time_step is not None:
             return self.scene.time_step, "given by the scene"
-        return stable_time_step(self.scene, self._solver.scales, self._depth)
+        return self._solver.stable_time_step()
 
     def _use_material(self, material):
         """Hand a material to the solver; the longest stable substep goes with it."""
         self.material = material
         self._solver.set_material(material)
-        self._stable_step, _ = stable_time_step(self.scene, self._solver.scales, self._depth)
+        self._stable_step, _ = self._solver.stable_time_step()
 
     # ---------------------------------------------------------------- time
 
@@ -115,7 +115,8 @@ class Simulation:
             particle / (PARTICLE_REACH * self.scene.support_radius),
         )
         for_speed = min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
-        return max(for_speed, math.ceil(dt / self._stable_step - 1e-6))
+        stable = min(self._stable_step, self._solver.longest_step())
+        return max(for_speed, math.ceil(dt / stable - 1e-6))
 
     def _liquid_reach(self):
         """Distance of the farthest particle from the origin of the world, at least [m]."""

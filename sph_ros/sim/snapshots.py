@@ -11,6 +11,7 @@ import numpy as np
 
 from sph_ros.sim import scene_types, shape_types
 from sph_ros.sim.materials import Material
+from sph_ros.sim.state import EXTRA
 
 FORMAT = 1
 
@@ -94,6 +95,9 @@ def _check_arrays(path, arrays):
             raise SnapshotError(
                 f"{path}: {name}: expected {kind} {shape}, found {rows.dtype} {rows.shape}"
             )
+    for name, rows in arrays.items():
+        if name.startswith(EXTRA) and rows.shape[:1] != (count,):
+            raise SnapshotError(f"{path}: {name}: expected {count} rows, found {rows.shape}")
 
 
 def read_snapshot(path):

@@ -11,6 +11,9 @@ from sph_ros.core.vector import LANES
 MOST_CELLS_PER_PARTICLE = 8
 MOST_CELLS_AT_LEAST = 1 << 16
 
+#: What the names of a fluid's extras begin with in a snapshot.
+EXTRA = "extra_"
+
 
 class Fluid:
     """The liquid: one row per particle, sorted by cell.
@@ -21,9 +24,10 @@ class Fluid:
         pressures: [Pa], (N,) float32; kept as the first guess of the next step.
         particle: which particle each row is; the public arrays are in this order, (N,) int32.
         ids: of the particles in public order, (N,) uint32.
+        extras: what else a solver keeps of each particle: name -> array with N rows.
     """
 
-    def __init__(self, positions, velocities, ids=None):
+    def __init__(self, positions, velocities, ids=None, extras=None):
         """Start with particles in public order."""
         count = len(positions)
         self.positions = np.ascontiguousarray(positions, dtype=np.float32).reshape(count, 3)
@@ -31,6 +35,7 @@ class Fluid:
         self.pressures = np.zeros(count, np.float32)
         self.particle = np.arange(count, dtype=np.int32)
         self.ids = np.arange(count, dtype=np.uint32) if ids is None else ids
+        self.extras = dict(extras or {})
 
     def __len__(self):
         """Number of particles."""
@@ -38,12 +43,14 @@ class Fluid:
 
     def arrays(self):
         """All arrays by name, for a snapshot."""
-        return dict(vars(self))
+        arrays = {name: rows for name, rows in vars(self).items() if name != "extras"}
+        return arrays | {EXTRA + name: rows for name, rows in self.extras.items()}
 
     @classmethod
     def of_arrays(cls, arrays):
         """The liquid of a snapshot."""
-        fluid = cls(arrays["positions"], arrays["velocities"], arrays["ids"])
+        extras = {n.removeprefix(EXTRA): a for n, a in arrays.items() if n.startswith(EXTRA)}
+        fluid = cls(arrays["positions"], arrays["velocities"], arrays["ids"], extras)
         fluid.pressures = arrays["pressures"]
         fluid.particle = arrays["particle"]
         return fluid
@@ -51,6 +58,13 @@ class Fluid:
     def copy(self):
         """A liquid of its own in the same state."""
         return self.of_arrays({name: rows.copy() for name, rows in self.arrays().items()})
+
+    def reorder(self, order):
+        """Let row k be what was row order[k], in all arrays but positions and velocities."""
+        self.pressures = self.pressures[order]
+        self.particle = self.particle[order]
+        for name, rows in self.extras.items():
+            self.extras[name] = rows[order]
 
     def public(self, rows):
         """Copy of an array with a row per particle, in public order."""

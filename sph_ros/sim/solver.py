@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all solvers do alike: sorting, neighbours, contacts, and stopping particles at solids."""
+
+import math
+import time
+
+import numpy as np
+
+from sph_ros.core import contacts as touch
+from sph_ros.core import neighbors as search
+from sph_ros.sim.state import Workspace, make_grid
+
+#: Distance that particles keep from solids, as a share of the spacing.
+MARGIN = 0.05
+
+
+class UnstableError(RuntimeError):
+    """A position or velocity is no longer a number."""
+
+
+class Solver:
+    """Base of the solvers. One that a scene can name has `step`, `densities`, `set_material` too.
+
+    Attributes:
+        scales: the numbers of the material; all solvers' have `mass` [kg] and `rest_density`.
+        iterations: of the last substep; 0 where a solver does not iterate.
+        density_error: mean density error left in the last substep [-].
+        fastest: speed of the fastest particle [m/s].
+        squeezed: particles rescued from between solids since somebody set it to 0.
+        timings: milliseconds of the last step by part.
+    """
+
+    def __init__(self, scene, solids, depth):
+        """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
+        self._scene = scene
+        self._solids = solids
+        self._depth = depth
+        self._gravity = np.array(scene.gravity, np.float32)
+        if scene.dimension == 2:
+            self._gravity[1] = 0.0
+        self._h = np.float32(scene.support_radius)
+        self._work = Workspace(0, len(solids))
+        self._packing = 1.0
+        self._listed = None
+        self.iterations = 0
+        self.density_error = 0.0
+        self.fastest = 0.0
+        self.squeezed = 0
+        self.timings = {}
+        self.set_material(scene.material)
+
+    def longest_step(self):
+        """The longest substep [s] that the present accelerations allow."""
+        return math.inf
+
+    def state(self):
+        """What a later step depends on beside the fluid, for a snapshot."""
+        return {
+            "fastest": self.fastest,
+            "iterations": self.iterations,
+            "density_error": self.density_error,
+            "squeezed": self.squeezed,
+        }
+
+    def set_state(self, state):
+        """Inverse of `state`."""
+        self.fastest, self.iterations = state["fastest"], state["iterations"]
+        self.density_error, self.squeezed = state["density_error"], state["squeezed"]
+
+    def _prepare(self, fluid):
+        """Scratch memory that fits, and its running totals at zero."""
+        if self._work.count != len(fluid):
+            self._work = Workspace(len(fluid), len(self._solids))
+        self._work.reactions[:] = 0.0
+
+    def _clock(self, part):
+        now = time.perf_counter()
+        if part == "start":
+            self._passed = now
+            return
+        self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
+        self._passed = now
+
+    def _keep_outside(self, starts, ends, origins, travel, motion, time_step):
+        work = self._work
+        scene = self._scene
+        if not len(self._solids):
+            return
+        work.squeezed[:] = 0
+        touch.keep_outside(
+            starts,
+            ends,
+            origins,
+            work.clearance,
+            np.float32(travel),
+            self._solids.packed,
+            motion,
+            np.float32(MARGIN * scene.spacing),
+            np.float32(scene.spacing),
+            scene.dimension == 2,
+            np.float32(self.scales.mass / time_step**2),
+            work.reactions,
+            work.squeezed,
+        )
+        self.squeezed += int(work.squeezed.sum())
+
+    def _grid(self):
+        lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
+        bad = search.bounding_box(self._work.predicted, lower, upper)
+        if bad >= 0:
+            raise UnstableError(f"row {bad}: its position is {self._work.predicted[bad]}")
+        return make_grid(lower, upper, float(self._h), self._work.count)
+
+    def _sort(self, fluid):
+        """Order all rows by cell of the predicted positions; velocities stay as they are.
+
+        Written are positions (from `starts`) and predicted positions of the workspace.
+        """
+        work = self._work
+        self._grid_now = grid = self._grid()
+        search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
+        search.gather_rows(work.order, work.starts, fluid.positions)
+        search.gather_rows(work.order, work.predicted, work.scratch)
+        work.predicted, work.scratch = work.scratch, work.predicted
+        fluid.reorder(work.order)
+        work.clearance = work.clearance[work.order]
+
+    def _find_contacts(self, time_step, clearance):
+        work = self._work
+        if len(self._solids):
+            touch.find_contacts(
+                work.predicted,
+                clearance,
+                self._solids.packed,
+                self._solids.motion,
+                np.float32(1.0 / time_step),
+                np.float32(self._packing),
+                work.chunks,
+                work.contacts,
+            )
+
+    def _find_neighbors(self):
+        work = self._work
+        search.transpose(work.predicted, work.columns)
+        while search.find_neighbors(work.columns, self._grid_now, self._h, work.chunks, work.pairs):
+            work.enlarge_pairs()

@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solvers by the names that scenes call them."""
+
+from sph_ros.sim.relaxation import RelaxationSolver
+
+SOLVER_CLASSES = {
+    "relaxation": RelaxationSolver,
+}
