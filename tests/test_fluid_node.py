@@ -10,7 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import RosSession
 from rosgraph_msgs.msg import Clock
@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.clock import clock_to_cdr
-from msg_adapters.marker import DELETE, TRIANGLE_LIST, cdr_to_marker, cdr_to_markers
+from msg_adapters.marker import DELETE, DELETE_ALL, TRIANGLE_LIST, cdr_to_marker, cdr_to_markers
 from msg_adapters.mesh import cdr_to_mesh
 from msg_adapters.point_cloud import cdr_to_particle_cloud
 from msg_adapters.pose import pose_to_cdr
@@ -30,6 +30,7 @@ from sph_ros.nodes.poses import OLDER_POSES_OF_A_RESTART, PoseGate, PoseRefusedE
 from sph_ros.nodes.publications import Publications, SurfaceJob
 from sph_ros.nodes.runner import Runner
 from sph_ros.nodes.schedules import ClockSchedule, WallSchedule
+from sph_ros.sim.scene import load_scene
 from sph_ros.sim.simulation import Simulation
 
 NODE = "sph_ros.nodes.fluid_node"
@@ -100,6 +101,15 @@ class FluidClient:
         number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
         request = SetParameters.Request(parameters=[Parameter(name=name, value=number)])
         return self.ros.call(SetParameters, "/fluid/set_parameters", request).results[0]
+
+    def set_scene(self, name):
+        text = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(name))
+        request = SetParameters.Request(parameters=[Parameter(name="scene", value=text)])
+        return self.ros.call(SetParameters, "/fluid/set_parameters", request).results[0]
+
+    def number(self, name):
+        request = GetParameters.Request(names=[name])
+        return self.ros.call(GetParameters, "/fluid/get_parameters", request).values[0].double_value
 
     def report(self, condition=lambda fluid, ball: True):
         """Next diagnostics that meet a condition: (level, values) of the fluid and of the ball."""
@@ -239,7 +249,7 @@ def test_parameters_are_described_ranged_and_live(fresh):
     request = DescribeParameters.Request(names=names)
     described = fresh.ros.call(DescribeParameters, "/fluid/describe_parameters", request)
     assert all(d.description for d in described.descriptors)
-    assert [d.read_only for d in described.descriptors] == [True, True, False, False]
+    assert [d.read_only for d in described.descriptors] == [False, True, False, False]
     assert all(d.floating_point_range for d in described.descriptors[2:])
     for value in (1e9, math.nan, -1.0):
         refusal = fresh.set_number("material.density", value)
@@ -251,6 +261,55 @@ def test_parameters_are_described_ranged_and_live(fresh):
     half = cdr_to_particle_cloud(fresh.particles[-1]).densities.mean()
     assert fresh.set_number("material.density", 1000.0).successful
     assert half == pytest.approx(0.5 * full, rel=0.05)
+
+
+OTHER_SCENE = """
+frame: bowl
+spacing: 0.02
+time_step: 0.005
+material: honey
+liquid:
+  - box: {min: [0, 0, 0], max: [0.08, 0.08, 0.04]}
+solids:
+  - name: bowl
+    container:
+      box: {min: [0, 0, 0], max: [0.08, 0.08, 0.2]}
+  - name: spoon
+    capsule: {radius: 0.01, length: 0.04}
+    pose: {position: [0.04, 0.04, 0.1]}
+    control: topic
+"""
+
+
+def test_another_scene_takes_over_and_a_wrong_one_changes_nothing(fresh, scene_path, tmp_path):
+    other = tmp_path / "bowl.yaml"
+    other.write_text(OTHER_SCENE)
+    before = cdr_to_particle_cloud(fresh.turn(*stir(0)))
+    for wrong, reason in (("no_such_scene", "no_such_scene"), (other.parent, "")):
+        refusal = fresh.set_scene(wrong)
+        assert not refusal.successful and reason in refusal.reason and refusal.reason
+    assert len(cdr_to_particle_cloud(fresh.turn(*stir(1))).ids) == len(before.ids)
+    try:
+        assert fresh.set_scene(other).successful
+        # The new solid listens, the old one does not; the material is the new scene's.
+        spoon = fresh.ros.node.create_publisher(PoseStamped, "/fluid/solids/spoon/pose", 10)
+        count = fresh.ros.node.count_subscribers
+        fresh.ros.wait_for(lambda: spoon.get_subscription_count() == 1)
+        fresh.ros.wait_for(lambda: count("/fluid/solids/ball/pose") == 0)
+        assert fresh.number("material.viscosity") == 8.0
+        fresh.solids.clear()
+        fresh.particles.clear()
+        spoon.publish(pose_to_cdr((0.05, 0.04, 0.1), UPRIGHT, 0, "bowl"))
+        fresh.ros.wait_for(lambda: fresh.particles and fresh.solids)
+        cloud = cdr_to_particle_cloud(fresh.particles[0])
+        assert cloud.header == (round(1e9 / RATE), "bowl") and len(cloud.ids) == 4 * 4 * 2
+        first, *solids = cdr_to_markers(fresh.solids[0])
+        assert first.action == DELETE_ALL
+        assert [marker.namespace for marker in solids] == ["bowl", "spoon"]
+    finally:
+        assert fresh.set_scene(scene_path).successful
+    assert fresh.number("material.viscosity") == 0.001
+    fresh.ros.wait_for(lambda: fresh.ros.node.count_subscribers("/fluid/solids/ball/pose") == 1)
 
 
 def test_pause_and_step_in_lockstep(fresh):
@@ -386,7 +445,7 @@ def test_no_liquid_deletes_the_surface(scene_path):
         publications = Publications(ros.node, Runner(str(scene_path), {}))
         publishers = [ros.node.count_publishers(f"/dry/{n}") for n in ("surface", "surface_mesh")]
         assert publishers == [1, 1]
-        nothing = SurfaceJob(np.empty((0, 3), np.float32), 5)
+        nothing = SurfaceJob(np.empty((0, 3), np.float32), 5, load_scene(str(scene_path)))
         ros.wait_for(lambda: publications.surface(nothing) == 0 and surfaces and meshes)
         marker = cdr_to_marker(surfaces[0])
         assert (marker.action, len(marker.points), marker.stamp_ns) == (DELETE, 0, 5)

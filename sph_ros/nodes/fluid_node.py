@@ -39,6 +39,7 @@ from sph_ros.nodes.running import run_node
 from sph_ros.nodes.schedules import ClockSchedule, WallSchedule
 from sph_ros.nodes.surface_worker import SurfaceWorker
 from sph_ros.sim.scene import SceneError, load_scene
+from sph_ros.sim.simulation import Simulation
 from sph_ros.waiting import tell_while_waiting, warm_up
 
 #: Warnings of one kind are at least so far apart [s].
@@ -61,7 +62,7 @@ class FluidNode(Node):
 
     def __init__(self, **kwargs):
         super().__init__("fluid", **kwargs)
-        self._driver = None
+        self._driver = self._prepared = None
         try:
             self._set_up()
         except BaseException:
@@ -70,7 +71,7 @@ class FluidNode(Node):
 
     def _set_up(self):
         self._settings = Settings(self)
-        scene_name, self._step_mode = self._settings.declare_fixed()
+        scene_name, self._step_mode = self._settings.declare_first()
         with tell_while_waiting(self._tell):
             scene = load_scene(scene_name)
             self._settings.declare_live(scene.material, self._step_mode)
@@ -80,15 +81,12 @@ class FluidNode(Node):
         self._surfaces = SurfaceWorker(self._publications.surface, self._warn_of_surface)
         self._driver = self._make_driver()
         self._apply_settings()
-        self._settings.follow(self._apply_settings)
+        self._settings.follow(self._apply_settings, self._prepare_scene)
+        self._poses = {}
         self._gates = self._subscribe()
         self._create_services()
         self._create_diagnostics()
-        sim = self._runner.sim
-        self.get_logger().info(
-            f"{scene.name}: {sim.particle_count} particles, step {sim.time_step * 1e3:.3g} ms "
-            f"({sim.time_step_reason}), {self._step_mode}"
-        )
+        self._introduce()
         if self._step_mode != "lockstep":
             self._surfaces.start()
         self._driver.start()
@@ -105,6 +103,13 @@ class FluidNode(Node):
     def _tell(self, seconds):
         self.get_logger().info(
             f"preparing, the first run compiles for up to a minute: {seconds:.0f} s"
+        )
+
+    def _introduce(self):
+        sim = self._runner.sim
+        self.get_logger().info(
+            f"{sim.scene.name}: {sim.particle_count} particles, step {sim.time_step * 1e3:.3g} ms "
+            f"({sim.time_step_reason}), {self._step_mode}"
         )
 
     def _make_driver(self):
@@ -140,14 +145,15 @@ class FluidNode(Node):
         depth = LOCKSTEP_POSE_DEPTH if self._step_mode == "lockstep" else POSE_DEPTH
 
         def give_way(_event):
-            self.destroy_subscription(subscription)
-            self._hear(gate, reliable=False, options=None)
+            if self._poses.get(gate.solid) is subscription:
+                self.destroy_subscription(subscription)
+                self._hear(gate, reliable=False, options=None)
 
         events = SubscriptionEventCallbacks(use_default_callbacks=False)
         if reliable:
             # Not in the event's own callback: it belongs to what is destroyed.
             events.incompatible_qos = lambda event: self.executor.create_task(give_way, event)
-        subscription = self.create_subscription(
+        subscription = self._poses[gate.solid] = self.create_subscription(
             PoseStamped,
             f"~/solids/{gate.solid}/pose",
             lambda buffer: self._on_pose(gate, buffer),
@@ -185,9 +191,46 @@ class FluidNode(Node):
             self._schedule.max_catch_up = settings["max_catch_up"]
         if self._step_mode == "realtime":
             self._schedule.speed = settings["speed"]
-        if names is not None and any(name.startswith(MATERIAL_PREFIX) for name in names):
+        if names is not None and "scene" in names:
+            self._change_scene(names)
+        elif names is not None and any(name.startswith(MATERIAL_PREFIX) for name in names):
             material = settings.material()
             driver.call(lambda: self._runner.sim.set_material(**material))
+
+    def _prepare_scene(self, name):
+        """Load a scene that is to take the place of the present one; SceneError if it cannot.
+
+        The driver does it: kernels on many threads must not be called by two threads at once.
+        """
+
+        def load():
+            sim = Simulation(load_scene(name))
+            warm_up(sim)
+            return sim
+
+        self._prepared = self._driver.call(load).result()
+
+    def _change_scene(self, names):
+        """Go on with the prepared scene from its start, and with its material.
+
+        Callbacks wait meanwhile, so that nobody sees a node between two scenes.
+        """
+        sim, self._prepared = self._prepared, None
+
+        def swap():
+            self._runner.replace(sim)
+            self._publications.follow_scene()
+            self._publications.forget_solids()
+            self._driver.reset()
+
+        self._driver.call(swap).result()
+        while self._poses:
+            self.destroy_subscription(self._poses.popitem()[1])
+        self._gates = self._subscribe()
+        self._settings.set_material(sim.scene.material, keep=names)
+        material = self._settings.material()
+        self._driver.call(lambda: sim.set_material(**material))
+        self._introduce()
 
     # ---------------------------------------------------------------- poses, publications
 

@@ -6,8 +6,10 @@ import re
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.parameter import Parameter
 
 from sph_ros.sim.materials import RANGES, Material, changed
+from sph_ros.sim.scene import SceneError
 
 STEP_MODES = ("realtime", "clock", "lockstep")
 
@@ -35,7 +37,7 @@ class ParameterError(ValueError):
 class Settings:
     """The parameters of a fluid node.
 
-    `declare_fixed` first: the scene that it names has the defaults of the live ones.
+    `declare_first` first: the scene that it names has the defaults of the live ones.
 
     Args:
         node: that gets the parameters.
@@ -43,15 +45,15 @@ class Settings:
 
     def __init__(self, node):
         self._node = node
-        self._apply = None
+        self._apply = self._prepare = None
 
-    def declare_fixed(self):
-        """Declare what needs a restart to change; returns (scene, step_mode)."""
+    def declare_first(self):
+        """Declare what all others depend on; returns (scene, step_mode)."""
         scene = self._declare(
             "scene",
             "ball_tank",
-            "scene: packaged name or path of a YAML file",
-            read_only=True,
+            "scene: packaged name or path of a YAML file; another one starts over with its own "
+            "material",
         )
         step_mode = self._declare(
             "step_mode",
@@ -92,9 +94,14 @@ class Settings:
             text = MATERIAL_TEXTS.get(field, field.replace("_", " "))
             number(MATERIAL_PREFIX + field, getattr(material, field), low, high, text)
 
-    def follow(self, apply):
-        """From now on check every change, and call `apply(names)` after each that was accepted."""
-        self._apply = apply
+    def follow(self, apply, prepare):
+        """From now on check every change, and put those to use that were accepted.
+
+        Args:
+            apply: called with the names of changed parameters after each change.
+            prepare: called with a scene's name before it is accepted; raises SceneError.
+        """
+        self._apply, self._prepare = apply, prepare
         self._node.add_on_set_parameters_callback(self._check)
         self._node.add_post_set_parameters_callback(self._applied)
 
@@ -105,6 +112,16 @@ class Settings:
     def material(self):
         """Present values of all fields of the material."""
         return {field: within_range(field, self[MATERIAL_PREFIX + field]) for field in RANGES}
+
+    def set_material(self, material, keep=()):
+        """Give all fields the values of a Material, as if somebody had set them, except `keep`."""
+        self._node.set_parameters_atomically(
+            [
+                Parameter(MATERIAL_PREFIX + field, value=float(getattr(material, field)))
+                for field in RANGES
+                if MATERIAL_PREFIX + field not in keep
+            ]
+        )
 
     def _declare_number(self, name, default, low, high, text):
         value = self._declare(
@@ -128,7 +145,7 @@ class Settings:
             raise ParameterError(f"parameter {name}: {_refusal(descriptor, error)}") from error
 
     def _check(self, parameters):
-        """Refuse a material that cannot be; rclpy has checked types and ranges. Changes nothing."""
+        """Refuse a material or scene that cannot be; rclpy has checked types and ranges."""
         values = self.material()
         for parameter in parameters:
             field = parameter.name.removeprefix(MATERIAL_PREFIX)
@@ -138,6 +155,13 @@ class Settings:
             changed(Material(), **values)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=f"{MATERIAL_PREFIX}{error}")
+        try:
+            for parameter in parameters:
+                if parameter.name == "scene":
+                    self._prepare(parameter.value)
+        except Exception as error:  # a scene that breaks something must not end the node
+            kind = "" if isinstance(error, SceneError) else f"{type(error).__name__}: "
+            return SetParametersResult(successful=False, reason=f"{kind}{_one_line(error)}")
         return SetParametersResult(successful=True)
 
     def _applied(self, parameters):
@@ -160,6 +184,10 @@ def _refusal(descriptor, error):
         return str(error)
     limit = descriptor.floating_point_range[0]
     return f"expected {limit.from_value:g} to {limit.to_value:g}, got {given[1]}"
+
+
+def _one_line(error):
+    return " ".join(str(error).split())
 
 
 def _type_name(value):

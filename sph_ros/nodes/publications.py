@@ -11,22 +11,30 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msg_adapters.marker import marker_to_cdr, markers_to_cdr
+from msg_adapters.marker import delete_marker, marker_to_cdr, markers_to_cdr
 from msg_adapters.mesh import mesh_to_cdr
 from msg_adapters.point_cloud import particle_cloud_to_cdr
 from msg_adapters.wrench import wrench_to_cdr
 from sph_ros.core.surface import extract_surface
 from sph_ros.scene_markers import SolidMarkers, surface_marker
+from sph_ros.sim.scene_types import Scene
 
 #: A depth of one loses messages of some megabytes.
 DEPTH = 2
 
 
 class SurfaceJob(NamedTuple):
-    """Positions [m], (N, 3) float32, whose surface is to be published with a stamp [ns]."""
+    """What a surface is made of; nothing in it changes while a thread works on it.
+
+    Attributes:
+        positions: [m], (N, 3) float32.
+        stamp_ns: of the positions [ns].
+        scene: that they belong to.
+    """
 
     positions: np.ndarray
     stamp_ns: int
+    scene: Scene
 
 
 class Publications:
@@ -38,17 +46,30 @@ class Publications:
     """
 
     def __init__(self, node, runner):
-        self._runner = runner
-        self._frame = runner.sim.scene.frame
-        create = _Creator(node)
+        self._node, self._runner = node, runner
+        create = self._create = _Creator(node)
         self._particles = create(PointCloud2, "~/particles")
         self._surface = create(Marker, "~/surface")
         self._surface_mesh = create(Mesh, "~/surface_mesh")
         self._solids = create(MarkerArray, "~/solids")
-        self._wrenches = [
-            create(WrenchStamped, f"~/solids/{name}/wrench") for name in runner.sim.solid_names
-        ]
-        self._solid_markers = SolidMarkers(runner.sim)
+        self._wrenches = {}
+        self._forget_solids = False
+        self.follow_scene()
+
+    def follow_scene(self):
+        """Publish what belongs to the runner's scene; to be called when it has another one."""
+        sim = self._runner.sim
+        self._frame = sim.scene.frame
+        for name in set(self._wrenches) - set(sim.solid_names):
+            self._node.destroy_publisher(self._wrenches.pop(name))
+        for name in sim.solid_names:
+            if name not in self._wrenches:
+                self._wrenches[name] = self._create(WrenchStamped, f"~/solids/{name}/wrench")
+        self._solid_markers = SolidMarkers(sim)
+
+    def forget_solids(self):
+        """Have viewers drop all solids they know before the next ones are drawn."""
+        self._forget_solids = True
 
     def state(self, stamp_ns, surface_due):
         """Publish particles, solids and wrenches.
@@ -67,26 +88,34 @@ class Publications:
                 )
             )
         if _heard(self._solids):
-            self._solids.publish(markers_to_cdr(self._solid_markers.at(stamp_ns)))
+            self._publish_solids(stamp_ns)
         self._publish_wrenches(stamp_ns)
-        return SurfaceJob(positions, stamp_ns) if wants_surface else None
+        return SurfaceJob(positions, stamp_ns, sim.scene) if wants_surface else None
 
     def surface(self, job):
         """Extract and publish a surface; returns its number of triangles. For any thread."""
-        scene = self._runner.sim.scene
+        scene = job.scene
         vertices, triangles, _ = extract_surface(
             job.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
         )
         if _heard(self._surface):
-            marker = surface_marker(vertices, triangles, job.stamp_ns, self._frame)
+            marker = surface_marker(vertices, triangles, job.stamp_ns, scene.frame)
             self._surface.publish(marker_to_cdr(marker))
         if _heard(self._surface_mesh):
             self._surface_mesh.publish(mesh_to_cdr(vertices, triangles))
         return len(triangles)
 
+    def _publish_solids(self, stamp_ns):
+        markers = self._solid_markers.at(stamp_ns)
+        if self._forget_solids:
+            markers.insert(0, delete_marker(stamp_ns, self._frame, everything=True))
+            self._forget_solids = False
+        self._solids.publish(markers_to_cdr(markers))
+
     def _publish_wrenches(self, stamp_ns):
         wrenches = self._runner.take_wrenches()
-        for publisher, wrench in zip(self._wrenches, wrenches, strict=True):
+        for name, wrench in zip(self._runner.sim.solid_names, wrenches, strict=True):
+            publisher = self._wrenches[name]
             if _heard(publisher):
                 data = wrench_to_cdr(wrench[:3], wrench[3:], stamp_ns, self._frame)
                 publisher.publish(data)

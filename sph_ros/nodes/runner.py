@@ -28,10 +28,15 @@ class Runner:
         Raises:
             SceneError: something in the scene is wrong.
         """
-        self.sim = Simulation(scene)
+        self.steps, self.busy = 0, 0.0
+        self.replace(Simulation(scene))
         self.sim.set_material(**material)
+
+    def replace(self, sim):
+        """Run another Simulation from now on."""
+        self.sim = sim
         self.fault = None
-        self.steps, self.busy, self.part_times = 0, 0.0, {}
+        self.part_times = {}
         self._clear_wrenches()
 
     def step(self):
