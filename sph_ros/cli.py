@@ -134,11 +134,12 @@ def _check(options):
         scene = load_scene(options.scene)
         sim = Simulation(scene)
     count = len(sim.positions)
-    needed = count * BYTES_PER_PARTICLE
+    needed = sim.capacity * BYTES_PER_PARTICLE
     chosen = "chosen" if scene.time_step is None else "given"
     solids = ", ".join(f"{solid.name} ({solid.control})" for solid in scene.solids) or "none"
     print(f"{scene.source}: good")
-    print(f"particles: {count:,} of {scene.material.name}, spacing {scene.spacing:g} m")
+    more = f", at most {sim.capacity:,}" if scene.emitters else ""
+    print(f"particles: {count:,}{more} of {scene.material.name}, spacing {scene.spacing:g} m")
     print(f"solver:    {scene.solver}, {scene.dimension}D")
     print(f"time step: {sim.time_step * 1e3:.3g} ms ({chosen})")
     print(f"solids:    {solids}")

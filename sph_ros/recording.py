@@ -21,6 +21,8 @@ NODE = "/fluid"
 STATISTICS = (
     "time",
     "particle_count",
+    "emitted_particles",
+    "removed_particles",
     "lost_particles",
     "mean_compression",
     "max_compression",

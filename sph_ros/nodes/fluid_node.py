@@ -107,9 +107,10 @@ class FluidNode(Node):
 
     def _introduce(self):
         sim = self._runner.sim
+        more = f" (at most {sim.capacity})" if sim.scene.emitters else ""
         self.get_logger().info(
-            f"{sim.scene.name}: {sim.particle_count} particles, step {sim.time_step * 1e3:.3g} ms "
-            f"({sim.time_step_reason}), {self._step_mode}"
+            f"{sim.scene.name}: {sim.particle_count} particles{more}, "
+            f"step {sim.time_step * 1e3:.3g} ms ({sim.time_step_reason}), {self._step_mode}"
         )
 
     def _make_driver(self):
@@ -361,6 +362,8 @@ class FluidNode(Node):
             "surface_time_ms": self._surfaces.milliseconds,
             "surface_triangles": self._surfaces.triangles,
             "particles": statistics["particle_count"],
+            "emitted_particles": statistics["emitted_particles"],
+            "removed_particles": statistics["removed_particles"],
             "lost_particles": statistics["lost_particles"],
             "mean_compression": statistics["mean_compression"],
             "max_compression": statistics["max_compression"],

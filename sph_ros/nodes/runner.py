@@ -98,7 +98,7 @@ class Runner:
             return {
                 "time": self.sim.time,
                 "particle_count": self.sim.particle_count,
-                "lost_particles": 0,
+                **dict.fromkeys(("emitted_particles", "removed_particles", "lost_particles"), 0),
                 **dict.fromkeys(keys, math.nan),
             }
 

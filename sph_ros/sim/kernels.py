@@ -34,6 +34,10 @@ _SCENE = {
             "control": "topic",
         },
     ],
+    "emitters": [
+        {"position": [0.05, 0.05, 0.27], "radius": 0.01, "speed": 2.0, "from": 0.0, "limit": 3}
+    ],
+    "sinks": [{"plane": {"offset": -1.0}}],
 }
 
 
@@ -72,7 +76,7 @@ def main():
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
         simulation.step()
         simulation.set_material(viscosity=0.001)
-        simulation.step()
+        simulation.advance(0.02)
         simulation.statistics()
         simulation.surface()
     Path(KERNELS, "complete").touch()

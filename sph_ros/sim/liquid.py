@@ -87,9 +87,8 @@ def lattice_counts(shape, scene):
 
 
 def estimated_particle_count(scene):
-    """Particles of the scene without making them, an upper bound; float, for it may be huge."""
-    blocks = sum(float(np.prod(lattice_counts(block.shape, scene))) for block in scene.liquid)
-    return blocks + sum(float(emitter.limit or 0) for emitter in scene.emitters)
+    """Particles of the start without making them, an upper bound; float, for it may be huge."""
+    return sum(float(np.prod(lattice_counts(block.shape, scene))) for block in scene.liquid)
 
 
 def available_memory():

@@ -69,7 +69,7 @@ class RelaxationSolver(Solver):
         self._predict(fluid, time_step)
         self._sort(fluid)
         self._clock("sort")
-        self._find_contacts(time_step, self._work.clearance)
+        self._find_contacts(time_step, fluid.clearance)
         self._clock("solids")
         self._find_neighbors()
         self._clock("neighbors")
@@ -89,7 +89,8 @@ class RelaxationSolver(Solver):
 
         Right after a step its lists and walls serve; they are off by the last displacement only.
         """
-        if self._listed is not fluid:
+        # A sink that took something since the step left rows that the lists do not know.
+        if self._listed is not fluid or self._work.count != len(fluid):
             # Sort a copy: asking must not change the order of sums in later steps.
             twin = fluid.copy()
             self._make_lists(twin)
@@ -132,7 +133,13 @@ class RelaxationSolver(Solver):
         work.starts[:] = fluid.positions
         travel = self._solids.travel
         self._keep_outside(
-            fluid.positions, work.predicted, work.starts, travel, self._solids.motion, time_step
+            fluid.positions,
+            work.predicted,
+            work.starts,
+            fluid.clearance,
+            travel,
+            self._solids.motion,
+            time_step,
         )
 
     def _sum_densities(self):
@@ -198,7 +205,9 @@ class RelaxationSolver(Solver):
             old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
         )
         # From the predicted position, which is beside the solids as they are now.
-        self._keep_outside(work.predicted, ends, fluid.positions, 0.0, still, time_step)
+        self._keep_outside(
+            work.predicted, ends, fluid.positions, fluid.clearance, 0.0, still, time_step
+        )
         relax.velocities_from_positions(
             fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors
         )

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, gradient_sum, lattice_sum
+from sph_ros.sim.jets import emission_height, make_jet
 
 #: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none,
 #: and its particles clump.
@@ -96,6 +97,16 @@ def liquid_depth(scene, positions):
         return 0.0
     along = positions @ [-c / g for c in scene.gravity]
     return float(along.max() - along.min()) + scene.spacing
+
+
+def scene_depth(scene, positions):
+    """Extent of the liquid along gravity [m], that of emitted liquid included.
+
+    Args:
+        scene: the scene.
+        positions: of the particles at the start [m], (N, 3).
+    """
+    return max(liquid_depth(scene, positions), emission_height(scene))
 
 
 def solver_scales(material, scene, depth):
@@ -169,7 +180,8 @@ def stable_time_step(scene, scales, drop):
     h = scene.support_radius
     g = math.sqrt(sum(c * c for c in scene.gravity))
     initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
-    initial = max(initial, max((e.speed or 0.0 for e in scene.emitters), default=0.0))
+    jets = [make_jet(emitter, scene).speed for emitter in scene.emitters]
+    initial = max(initial, max(jets, default=0.0))
     speed = max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
     bounds = {f"particles up to {speed:.2g} m/s": COURANT * h / speed}
     soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)

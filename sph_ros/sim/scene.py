@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes: YAML files or dicts in, checked frozen dataclasses out."""
 
+import logging
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from sph_ros.sim.jets import ENDLESS, capacity, make_jet
 from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import (
     BYTES_PER_PARTICLE,
@@ -17,7 +20,7 @@ from sph_ros.sim.liquid import (
     lattice_counts,
 )
 from sph_ros.sim.materials import MATERIALS, Material
-from sph_ros.sim.scene_types import SOLVERS, Emitter, Keyframe, LiquidBlock, Scene, SolidSpec
+from sph_ros.sim.scene_types import SOLVERS, Emitter, Keyframe, LiquidBlock, Scene, Sink, SolidSpec
 from sph_ros.sim.scene_yaml import Node, SceneError, build, check_keys, nearest, read_dict
 from sph_ros.sim.scene_yaml import read_file as read_yaml
 from sph_ros.sim.shapes import (
@@ -43,6 +46,7 @@ __all__ = [
     "Material",
     "Scene",
     "SceneError",
+    "Sink",
     "SolidSpec",
     "bag_path",
     "fill_liquid",
@@ -50,6 +54,8 @@ __all__ = [
     "load_scene",
     "scene_path",
 ]
+
+_LOG = logging.getLogger(__name__)
 
 #: Liquid farther from the origin moves in steps that one sees: 6e-8 of the distance is 3e-4 of a
 #: spacing here.
@@ -128,6 +134,7 @@ def load_scene(source):
     scene = _read_scene(root, folder, name)
     _check_amount(scene, root)
     _check_solids(scene, root)
+    _check_openings(scene, root)
     return scene
 
 
@@ -141,6 +148,7 @@ def _read_scene(root: Node, folder: Path, name: str) -> Scene:
         "material": _read_material,
         "liquid": lambda node: tuple(_read_liquid(item) for item in node.items()),
         "emitters": lambda node: tuple(_read_emitter(item) for item in node.items()),
+        "sinks": lambda node: tuple(_read_sink(item) for item in node.items()),
         "solids": lambda node: tuple(_read_solid(item, folder) for item in node.items()),
         "time_step": _read_auto,
         "support_radius": _read_auto,
@@ -192,6 +200,13 @@ def _read_pose(node: Node) -> Pose:
 
 def _read_emitter(node: Node) -> Emitter:
     return build(Emitter, node, renamed={"from_time": "from"})
+
+
+def _read_sink(node: Node) -> Sink:
+    shape = _read_shape(node, SINK_KEYS, None)
+    rest = _without(node, SINK_KEYS)
+    renamed = {"from_time": "from"}
+    return build(Sink, rest, {"pose": _read_pose}, renamed=renamed, extra={"shape": shape})
 
 
 def _read_liquid(node: Node) -> LiquidBlock:
@@ -283,6 +298,7 @@ SHAPE_KEYS = {
     "container": _read_container,
 }
 LIQUID_KEYS = ("box", "sphere", "cylinder", "capsule")
+SINK_KEYS = (*LIQUID_KEYS, "plane")
 
 
 # ---------------------------------------------------------------- whole scene
@@ -295,7 +311,8 @@ def _check_amount(scene: Scene, root: Node) -> None:
             raise _item(root, "liquid", index).error(
                 f"smaller than one particle (spacing {scene.spacing:g} m); lengths are in metres"
             )
-    count = estimated_particle_count(scene)
+    _check_emitters(scene, root)
+    count = capacity(scene, estimated_particle_count(scene))
     needed, available = count * BYTES_PER_PARTICLE, available_memory()
     if needed > available or count > 2**31 - 1:
         children = root.mapping()
@@ -303,6 +320,38 @@ def _check_amount(scene: Scene, root: Node) -> None:
             f"{scene.spacing:g} m makes about {count:,.0f} particles, which need "
             f"{needed / 1e9:,.1f} GB of memory; {available / 1e9:,.1f} GB is available"
         )
+
+
+def _check_emitters(scene: Scene, root: Node) -> None:
+    """Refuse jets that cannot be, and say how many particles an endless one makes at most."""
+    for index, emitter in enumerate(scene.emitters):
+        node = _item(root, "emitters", index)
+        try:
+            make_jet(emitter, scene)
+        except ValueError as error:
+            key, _, text = str(error).partition(": ")
+            raise node.mapping().get(key, node).error(text) from None
+        endless = emitter.limit is None and emitter.until == math.inf
+        if endless and scene.max_particles is None:
+            _LOG.warning(
+                "%s: %s: neither limit nor until: waits where there are %s particles more than at "
+                "the start; max_particles sets another number",
+                node.where,
+                node.key,
+                f"{ENDLESS:,}",
+            )
+
+
+def _check_openings(scene: Scene, root: Node) -> None:
+    """Refuse emitters that lie inside a fixed solid: nothing would ever come out."""
+    for index, emitter in enumerate(scene.emitters):
+        places = make_jet(emitter, scene).places
+        for solid in scene.solids:
+            distance = distances_to(solid.shape, solid.pose, places, scene)
+            if solid.control == "fixed" and (distance < 0.0).all():
+                raise _item(root, "emitters", index).error(
+                    f"the opening lies inside solid {solid.name!r}"
+                )
 
 
 def _check_solids(scene: Scene, root: Node) -> None:

@@ -17,20 +17,18 @@ from sph_ros.sim.quantities import (
     replace_fields,
     unit_vector,
 )
-from sph_ros.sim.shapes import Box, Capsule, Cylinder, Pose, Shape, Sphere
+from sph_ros.sim.shapes import Box, Capsule, Cylinder, Plane, Pose, Shape, Sphere
 
 #: Solvers that exist, and those that are announced but cannot be chosen yet.
 SOLVERS = ("relaxation",)
 PLANNED_SOLVERS = ("forces", "incompressible")
-
-#: Emitters are read and checked; a scene with one is refused until a simulation runs them.
-EMITTERS_AVAILABLE = False
 
 #: Who moves a solid.
 CONTROLS = ("fixed", "topic", "path")
 PLANNED_CONTROLS = ("free",)
 
 LIQUID_SHAPES = (Box, Sphere, Cylinder, Capsule)
+SINK_SHAPES = (*LIQUID_SHAPES, Plane)
 
 _TOPIC_TOKEN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -59,12 +57,15 @@ class LiquidBlock:
 
 @dataclass(frozen=True)
 class Emitter:
-    """A round opening that liquid comes out of.
+    """A round opening (in 2D a slit) that liquid comes out of.
+
+    With speed or rate alone the jet has rest density. With both, a rate below that makes single
+    drops.
 
     Attributes:
         position: centre of the opening [m], scene's frame.
         direction: of the jet, normalised on construction.
-        radius: of the opening [m].
+        radius: of the opening, in 2D half its length [m].
         speed: of the liquid [m/s]; follows from `rate` unless given.
         rate: particles per second; follows from `speed` unless given.
         from_time: first moment [s]; key `from` in the file.
@@ -87,12 +88,43 @@ class Emitter:
         replace_fields(self, direction=unit_vector("direction", self.direction))
         if self.speed is None and self.rate is None:
             raise ValueError("speed: expected a speed [m/s] or a rate [particles/s], got neither")
-        if self.until <= self.from_time:
-            raise ValueError(
-                f"until: expected more than from ({self.from_time:g} s), got {self.until:g}"
-            )
+        _check_times(self)
         if self.limit is not None:
             replace_fields(self, limit=int(self.limit))
+
+
+@dataclass(frozen=True)
+class Sink:
+    """A region that takes away what gets into it.
+
+    In a substep particles cross less than a support radius: a thinner region can be jumped over.
+
+    Attributes:
+        shape: of the region; its own frame.
+        pose: of the shape's frame in the scene's frame.
+        from_time: first moment [s]; key `from` in the file.
+        until: last moment [s].
+    """
+
+    shape: Shape
+    pose: Pose = Pose()
+    from_time: float = quantity("s", 0.0, low=0.0, high=1e9)
+    until: float = quantity("s", math.inf, low=0.0)
+
+    def __post_init__(self):
+        """Refuse shapes without an inside, and a sink that is never open."""
+        if not isinstance(self.shape, SINK_SHAPES):
+            known = ", ".join(shape.__name__.lower() for shape in SINK_SHAPES)
+            raise ValueError(f"shape: a sink can be a {known}; got {self.shape!r}")
+        check_quantities(self)
+        _check_times(self)
+
+
+def _check_times(item):
+    if item.until <= item.from_time:
+        raise ValueError(
+            f"until: expected more than from ({item.from_time:g} s), got {item.until:g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -184,6 +216,9 @@ class Scene:
         time_step: [s]; None: chosen by the solver so that it is stable.
         liquid: at the start.
         emitters: of more liquid, later.
+        sinks: where liquid leaves the scene.
+        max_particles: there are never more at once, emitters wait; None: those of the start and all
+            that the emitters can emit, 20,000 for one without limit and end.
         solids: in the order of the file.
         max_solid_speed: solids sweep towards their poses no faster than this [m/s].
         source: file the scene came from, or "<dict>".
@@ -201,6 +236,8 @@ class Scene:
     time_step: float | None = quantity("s", None, above=0.0, high=0.1)
     liquid: tuple[LiquidBlock, ...] = ()
     emitters: tuple[Emitter, ...] = ()
+    sinks: tuple[Sink, ...] = ()
+    max_particles: int | None = quantity("particles", None, low=1, high=1e9)
     solids: tuple[SolidSpec, ...] = ()
     max_solid_speed: float = quantity("m/s", 3.0, above=0.0, high=100.0)
     source: str = "<dict>"
@@ -210,6 +247,8 @@ class Scene:
         """Refuse what does not fit together."""
         check_quantities(self)
         self._check_words()
+        if self.max_particles is not None:
+            replace_fields(self, max_particles=int(self.max_particles))
         if self.support_radius is None:
             replace_fields(self, support_radius=2.0 * self.spacing)
         low, high = 1.2 * self.spacing, 4.0 * self.spacing
@@ -225,8 +264,6 @@ class Scene:
             raise ValueError(f"solver: {self.solver!r} is not available yet; {SOLVERS} are")
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
-        if self.emitters and not EMITTERS_AVAILABLE:
-            raise ValueError("emitters: no solver of this version emits particles yet")
         if type(self.dimension) is not int or self.dimension not in (2, 3):
             raise ValueError(f"dimension: expected 2 or 3, got {self.dimension!r}")
         for key in ("name", "frame", "description"):

@@ -19,6 +19,7 @@ from sph_ros.sim.shape_types import (
     Mesh,
     Placed,
     Plane,
+    Pose,
     Shape,
     Sphere,
     Union,
@@ -80,7 +81,7 @@ def _extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         return _extent(shape.shape)
     else:
         parts = shape.of if isinstance(shape, Union) else shape.of[:1]
-        extents = [_placed_extent(part) for part in parts]
+        extents = [placed_extent(part.shape, part.pose) for part in parts]
         return (
             np.min([extent[0] for extent in extents], axis=0),
             np.max([extent[1] for extent in extents], axis=0),
@@ -88,12 +89,16 @@ def _extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     return -half, half
 
 
-def _placed_extent(part: Placed) -> tuple[np.ndarray, np.ndarray]:
-    lower, upper = _extent(part.shape)
+def placed_extent(shape: Shape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box along the parent's axes that holds a placed shape [m].
+
+    Infinite for planes; for a container that of the inner shape.
+    """
+    lower, upper = _extent(shape)
     if not np.isfinite(upper - lower).all():
         return np.full(3, -math.inf), np.full(3, math.inf)
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
-    corners = corners @ to_matrix(part.pose.quat_xyzw).T + part.pose.position
+    corners = corners @ to_matrix(pose.quat_xyzw).T + pose.position
     return corners.min(axis=0), corners.max(axis=0)
 
 

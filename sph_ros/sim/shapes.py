@@ -3,7 +3,7 @@
 
 from sph_ros.sim.meshes import MeshError
 from sph_ros.sim.packing import pack_shapes
-from sph_ros.sim.shape_geometry import bounding_radius, display_mesh, volume
+from sph_ros.sim.shape_geometry import bounding_radius, display_mesh, placed_extent, volume
 from sph_ros.sim.shape_types import (
     SHAPES,
     Box,
@@ -38,5 +38,6 @@ __all__ = [
     "bounding_radius",
     "display_mesh",
     "pack_shapes",
+    "placed_extent",
     "volume",
 ]

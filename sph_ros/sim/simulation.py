@@ -6,13 +6,16 @@ import math
 import numpy as np
 
 from sph_ros.core.surface import extract_surface
+from sph_ros.sim.emitters import Emitters
+from sph_ros.sim.jets import capacity
 from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import fill_liquid
 from sph_ros.sim.materials import changed
-from sph_ros.sim.scales import liquid_depth
+from sph_ros.sim.scales import scene_depth
 from sph_ros.sim.scene import load_scene
 from sph_ros.sim.scene_types import Scene
 from sph_ros.sim.shapes import Container
+from sph_ros.sim.sinks import Sinks
 from sph_ros.sim.snapshots import read_snapshot, write_snapshot
 from sph_ros.sim.solids import Solids
 from sph_ros.sim.solvers import SOLVER_CLASSES
@@ -28,7 +31,9 @@ MOST_SUBSTEPS = 8
 class Simulation:
     """A liquid among solids, stepped in time.
 
-    Arrays of particles have a row for each particle; row i is the same particle for ever.
+    Arrays of particles have a row for each particle, in the order of their ids. Without emitters
+    and sinks row i is the same particle for ever; emitted particles are appended with new ids,
+    removed ones leave no gap and their ids are never given again.
 
     Attributes:
         scene: the `Scene` it was made from.
@@ -36,6 +41,7 @@ class Simulation:
         time_step_reason: what bounds an automatic time step, in words.
         time: simulated time [s].
         material: the present material.
+        capacity: there are never more particles at once.
         timings: milliseconds of the last step by part.
     """
 
@@ -54,8 +60,12 @@ class Simulation:
     def _start(self):
         """First state: the liquid of the scene, solids at their first poses."""
         positions, velocities = fill_liquid(self.scene)
-        depth = liquid_depth(self.scene, positions)
-        self._fluid = Fluid(positions, velocities)
+        depth = scene_depth(self.scene, positions)
+        self.capacity = capacity(self.scene, len(positions))
+        self._fluid = Fluid(positions, velocities, capacity=self.capacity)
+        self._next_id = len(positions)
+        self._emitters = Emitters(self.scene)
+        self._sinks = Sinks(self.scene, self._solids, positions)
         self._solver = SOLVER_CLASSES[self.scene.solver](self.scene, self._solids, depth)
         self._use_material(self.material)
         self.time_step, self.time_step_reason = self._choose_time_step()
@@ -96,7 +106,9 @@ class Simulation:
         for part in range(count):
             now = self.time + part * duration
             self._solids.advance(now, duration, fastest, self._liquid_reach())
+            self._next_id = self._emitters.advance(self._fluid, self._solids, now, self._next_id)
             self._reactions += self._solver.step(self._fluid, now, duration) / count
+            self._sinks.advance(self._fluid, now + duration)
         self.timings = self._solver.timings
         self._substeps = count
         self._steps += 1
@@ -109,7 +121,7 @@ class Simulation:
             self._solids.distance_ahead(self.time, dt, self._liquid_reach()),
             self.scene.max_solid_speed * dt,
         )
-        particle = self._solver.fastest * dt
+        particle = max(self._solver.fastest, self._emitters.fastest(self.time)) * dt
         wanted = max(
             ahead / (SOLID_REACH * self.scene.spacing),
             particle / (PARTICLE_REACH * self.scene.support_radius),
@@ -142,6 +154,9 @@ class Simulation:
             "substeps": self._substeps,
             "reactions": self._reactions.tolist(),
             "solver": self._solver.state(),
+            "next_id": self._next_id,
+            "emitters": self._emitters.state(),
+            "sinks": self._sinks.state(),
             "solids": {solid.name: solid.state() for solid in self._solids},
         }
         arrays = {**self._fluid.arrays(), "densities": self._relative_densities()}
@@ -156,10 +171,13 @@ class Simulation:
         """
         scene, material, arrays, numbers = read_snapshot(path)
         simulation = cls(scene)
-        simulation._fluid = Fluid.of_arrays(arrays)
+        simulation._fluid = Fluid.of_arrays(arrays, simulation.capacity)
         simulation._densities = arrays["densities"]
         simulation._use_material(material)
         simulation._solver.set_state(numbers["solver"])
+        simulation._next_id = numbers["next_id"]
+        simulation._emitters.set_state(numbers["emitters"])
+        simulation._sinks.set_state(numbers["sinks"])
         simulation._steps = numbers["steps"]
         simulation.time_step, simulation.time_step_reason = numbers["time_step"]
         simulation._substeps = numbers["substeps"]
@@ -293,10 +311,11 @@ class Simulation:
         Returns:
             dict with time [s], particle_count, mean_compression and max_compression (density above
             rest over rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s],
-            lost_particles (those outside a container or no longer finite),
-            squeezed_particles (rescued from between solids in the last step), substeps and
-            iterations of the last step, density_error (mean, left by the last iteration, -). In 2D
-            energies and momenta are per metre of depth.
+            emitted_particles and removed_particles (by sinks) since the start, lost_particles
+            (those outside a container or no longer finite, and those that were removed because they
+            got far away from everything), squeezed_particles (rescued from between solids in the
+            last step), substeps and iterations of the last step, density_error (mean, left by the
+            last iteration, -). In 2D energies and momenta are per metre of depth.
         """
         velocities = self._fluid.velocities.astype(np.float64)
         mass = self._solver.scales.mass
@@ -310,7 +329,9 @@ class Simulation:
             "kinetic_energy": 0.5 * mass * float(square.sum()),
             "momentum": mass * velocities.sum(axis=0),
             "max_speed": math.sqrt(float(square.max(initial=0.0))),
-            "lost_particles": self._lost_count(),
+            "emitted_particles": self._emitters.emitted,
+            "removed_particles": self._sinks.removed,
+            "lost_particles": self._sinks.lost + self._lost_count(),
             "squeezed_particles": self._solver.squeezed,
             "substeps": self._substeps,
             "iterations": self._solver.iterations,

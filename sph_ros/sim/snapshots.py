@@ -23,6 +23,7 @@ _CLASSES = {
         shape_types.Placed,
         scene_types.LiquidBlock,
         scene_types.Emitter,
+        scene_types.Sink,
         scene_types.Keyframe,
         scene_types.SolidSpec,
         scene_types.Scene,

@@ -69,8 +69,10 @@ class Solver:
 
     def _prepare(self, fluid):
         """Scratch memory that fits, and its running totals at zero."""
+        if self._work.capacity < fluid.capacity:
+            self._work = Workspace(fluid.capacity, len(self._solids))
         if self._work.count != len(fluid):
-            self._work = Workspace(len(fluid), len(self._solids))
+            self._work.fit(len(fluid))
         self._work.reactions[:] = 0.0
 
     def _clock(self, part):
@@ -81,7 +83,7 @@ class Solver:
         self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
         self._passed = now
 
-    def _keep_outside(self, starts, ends, origins, travel, motion, time_step):
+    def _keep_outside(self, starts, ends, origins, clearance, travel, motion, time_step):
         work = self._work
         scene = self._scene
         if not len(self._solids):
@@ -91,7 +93,7 @@ class Solver:
             starts,
             ends,
             origins,
-            work.clearance,
+            clearance,
             np.float32(travel),
             self._solids.packed,
             motion,
@@ -123,7 +125,6 @@ class Solver:
         search.gather_rows(work.order, work.predicted, work.scratch)
         work.predicted, work.scratch = work.scratch, work.predicted
         fluid.reorder(work.order)
-        work.clearance = work.clearance[work.order]
 
     def _find_contacts(self, time_step, clearance):
         work = self._work

@@ -18,53 +18,78 @@ EXTRA = "extra_"
 class Fluid:
     """The liquid: one row per particle, sorted by cell.
 
+    There is room for `capacity` particles from the start; the arrays are views of those that exist.
+    Change them in place: assigning another array would cut the view off from the room behind it.
+
     Attributes:
         positions: [m], world frame, (N, 3) float32.
         velocities: [m/s], (N, 3) float32.
         pressures: [Pa], (N,) float32; kept as the first guess of the next step.
+        clearance: distance that a particle certainly has from all solids [m], (N,) float32; zeros
+            would do.
         particle: which particle each row is; the public arrays are in this order, (N,) int32.
-        ids: of the particles in public order, (N,) uint32.
-        extras: what else a solver keeps of each particle: name -> array with N rows.
+        ids: of the particles in public order, rising, (N,) uint32.
+        extras: what else a solver keeps of each particle: name -> array with N rows; those of new
+            particles are 0.
+        capacity: particles that there is room for.
     """
 
-    def __init__(self, positions, velocities, ids=None, extras=None):
+    #: Arrays whose rows are in the order of `particle`: columns (0: a plain number), type.
+    ROWS = {
+        "positions": (3, np.float32),
+        "velocities": (3, np.float32),
+        "pressures": (0, np.float32),
+        "clearance": (0, np.float32),
+        "particle": (0, np.int32),
+    }
+
+    #: What a snapshot need not keep.
+    PASSING = ("clearance",)
+
+    def __init__(self, positions, velocities, ids=None, extras=None, capacity=0):
         """Start with particles in public order."""
         count = len(positions)
-        self.positions = np.ascontiguousarray(positions, dtype=np.float32).reshape(count, 3)
-        self.velocities = np.ascontiguousarray(velocities, dtype=np.float32).reshape(count, 3)
-        self.pressures = np.zeros(count, np.float32)
-        self.particle = np.arange(count, dtype=np.int32)
-        self.ids = np.arange(count, dtype=np.uint32) if ids is None else ids
+        self.capacity = max(capacity, count)
+        self._store = {
+            name: np.zeros((self.capacity, columns) if columns else self.capacity, kind)
+            for name, (columns, kind) in self.ROWS.items()
+        }
+        self._store["ids"] = np.zeros(self.capacity, np.uint32)
+        self._resize(count)
+        self.positions[:] = np.reshape(positions, (count, 3))
+        self.velocities[:] = np.reshape(velocities, (count, 3))
+        self.particle[:] = np.arange(count)
+        self.ids[:] = np.arange(count) if ids is None else ids
         self.extras = dict(extras or {})
+
+    def _resize(self, count):
+        for name, rows in self._store.items():
+            setattr(self, name, rows[:count])
 
     def __len__(self):
         """Number of particles."""
         return len(self.particle)
 
     def arrays(self):
-        """All arrays by name, for a snapshot."""
-        arrays = {name: rows for name, rows in vars(self).items() if name != "extras"}
+        """All arrays by name that a later step depends on, for a snapshot."""
+        arrays = {name: getattr(self, name) for name in self._store if name not in self.PASSING}
         return arrays | {EXTRA + name: rows for name, rows in self.extras.items()}
 
     @classmethod
-    def of_arrays(cls, arrays):
+    def of_arrays(cls, arrays, capacity=0):
         """The liquid of a snapshot."""
         extras = {n.removeprefix(EXTRA): a for n, a in arrays.items() if n.startswith(EXTRA)}
-        fluid = cls(arrays["positions"], arrays["velocities"], arrays["ids"], extras)
-        fluid.pressures = arrays["pressures"]
-        fluid.particle = arrays["particle"]
+        fluid = cls(arrays["positions"], arrays["velocities"], arrays["ids"], extras, capacity)
+        for name in arrays:
+            if name in fluid._store:
+                getattr(fluid, name)[:] = arrays[name]
         return fluid
 
     def copy(self):
-        """A liquid of its own in the same state."""
-        return self.of_arrays({name: rows.copy() for name, rows in self.arrays().items()})
-
-    def reorder(self, order):
-        """Let row k be what was row order[k], in all arrays but positions and velocities."""
-        self.pressures = self.pressures[order]
-        self.particle = self.particle[order]
-        for name, rows in self.extras.items():
-            self.extras[name] = rows[order]
+        """A liquid of its own in the same state, with no room for more."""
+        twin = self.of_arrays(self.arrays())
+        twin.extras = {name: rows.copy() for name, rows in self.extras.items()}
+        return twin
 
     def public(self, rows):
         """Copy of an array with a row per particle, in public order."""
@@ -72,74 +97,141 @@ class Fluid:
         result[self.particle] = rows
         return result
 
+    def reorder(self, order):
+        """Let row k be what was row order[k], in all arrays but positions and velocities."""
+        for rows in (self.pressures, self.clearance, self.particle, *self.extras.values()):
+            rows[:] = rows[order]
+
+    def add(self, positions, velocities, ids):
+        """Append particles whose ids are higher than all others; other rows of theirs are 0."""
+        start = len(self)
+        end = start + len(positions)
+        self._resize(end)
+        for name in self.ROWS:
+            getattr(self, name)[start:] = 0
+        self.positions[start:], self.velocities[start:] = positions, velocities
+        self.particle[start:] = np.arange(start, end)
+        self.ids[start:] = ids
+        for name, rows in self.extras.items():
+            new = np.zeros((end - start, *rows.shape[1:]), rows.dtype)
+            self.extras[name] = np.concatenate([rows, new])
+
+    def keep(self, rows):
+        """Remove all particles but those where `rows` (N,) bool, in the order of rows, is true."""
+        alive = np.zeros(len(self), bool)
+        alive[self.particle[rows]] = True
+        place = np.cumsum(alive, dtype=np.int32) - 1
+        count = int(place[-1]) + 1 if len(place) else 0
+        for name in self.ROWS:
+            getattr(self, name)[:count] = getattr(self, name)[rows]
+        self.particle[:count] = place[self.particle[:count]]
+        self.ids[:count] = self.ids[alive]
+        self.extras = {name: values[rows] for name, values in self.extras.items()}
+        self._resize(count)
+
 
 class Workspace:
     """Scratch memory for one step of N particles among S solids. Holds no result.
 
+    Allocated once for as many particles as there can be; `fit` makes the arrays views of the first
+    N rows.
+
     Attributes:
+        count: N.
         chunks: pieces of parallel work.
         predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses: of the pressure iterations, (N,) float32.
-        clearance: distance that a particle certainly has from all solids [m], (N,) float32; the
-            only thing here that a later step reads, and zeros would do.
         errors: (chunks,) float64; squeezed: (chunks,) int64.
         reactions: wrench per chunk and solid, (chunks, S, 6) float64.
         pairs, sums, contacts: see their classes.
     """
 
-    def __init__(self, count, solids, pairs_per_particle=44):
-        """Allocate for `count` particles and `solids` solids."""
-        self.count = count
+    #: Arrays with a row per particle: columns (0: a plain number), type.
+    ROWS = {
+        "predicted": (3, np.float32),
+        "starts": (3, np.float32),
+        "scratch": (3, np.float32),
+        "displacements": (3, np.float32),
+        "cohesive": (3, np.float32),
+        "cell_of": (0, np.int32),
+        "order": (0, np.int32),
+        "diagonal": (0, np.float32),
+        "scaled": (0, np.float32),
+        "guesses": (0, np.float32),
+    }
+
+    def __init__(self, capacity, solids, pairs_per_particle=44):
+        """Allocate for `capacity` particles, all of which are there, and `solids` solids."""
+        self.capacity = capacity
         self.solids = solids
-        self.chunks = max(chunk_count(count), 1)
-        self.predicted = np.empty((count, 3), np.float32)
-        self.starts = np.empty((count, 3), np.float32)
-        self.scratch = np.empty((count, 3), np.float32)
-        self.displacements = np.empty((count, 3), np.float32)
-        self.cohesive = np.zeros((count, 3), np.float32)
-        self.columns = np.zeros((3, count + LANES), np.float32)
-        self.cell_of = np.empty(count, np.int32)
-        self.order = np.empty(count, np.int32)
-        self.diagonal = np.empty(count, np.float32)
-        self.clearance = np.zeros(count, np.float32)
-        self.scaled = np.empty(count, np.float32)
-        self.guesses = np.empty(count, np.float32)
-        self.errors = np.zeros(self.chunks, np.float64)
-        self.squeezed = np.zeros(self.chunks, np.int64)
-        self.reactions = np.zeros((self.chunks, solids, 6), np.float64)
-        self.sums = Sums(
-            np.ones(count, np.float32),
-            np.ones(count, np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.float32),
+        chunks = max(chunk_count(capacity), 1)
+        self._store = {
+            name: np.zeros((capacity, columns) if columns else capacity, kind)
+            for name, (columns, kind) in self.ROWS.items()
+        }
+        self._chunk_store = {
+            "errors": np.zeros(chunks, np.float64),
+            "squeezed": np.zeros(chunks, np.int64),
+            "reactions": np.zeros((chunks, solids, 6), np.float64),
+        }
+        self._columns = np.zeros(3 * (capacity + LANES), np.float32)
+        self._sums = Sums(
+            np.ones(capacity, np.float32),
+            np.ones(capacity, np.float32),
+            np.empty((capacity, 3), np.float32),
+            np.empty(capacity, np.float32),
         )
-        room = self.chunks * CHUNK * solids
-        self.contacts = Contacts(
-            np.zeros(count, np.int64),
-            np.zeros(count, np.int64),
+        room = chunks * CHUNK * solids
+        self._contacts = Contacts(
+            np.zeros(capacity, np.int64),
+            np.zeros(capacity, np.int64),
             np.empty(room, np.int32),
             np.empty((room, TERMS), np.float32),
-            np.zeros((count, 2), np.float32),
-            np.zeros((count, 6), np.float32),
+            np.zeros((capacity, 2), np.float32),
+            np.zeros((capacity, 6), np.float32),
         )
         self._allocate_pairs(pairs_per_particle)
+        self.fit(capacity)
+
+    def fit(self, count):
+        """Make all arrays those of `count` particles; what is in them is of no use then."""
+        self.count = count
+        self.chunks = max(chunk_count(count), 1)
+        for name, rows in self._store.items():
+            setattr(self, name, rows[:count])
+        for name, rows in self._chunk_store.items():
+            setattr(self, name, rows[: self.chunks])
+        self.columns = self._columns[: 3 * (count + LANES)].reshape(3, count + LANES)
+        self.sums = Sums(*(rows[:count] for rows in self._sums))
+        lists = {name: getattr(self._contacts, name)[:count] for name in _PER_PARTICLE}
+        self.contacts = self._contacts._replace(**lists)
+        self._fit_pairs()
 
     def _allocate_pairs(self, per_particle):
-        room = self.chunks * CHUNK * per_particle
+        room = max(chunk_count(self.capacity), 1) * CHUNK * per_particle
         self.pairs_per_particle = per_particle
-        self.pairs = Pairs(
-            np.zeros(self.count, np.int64),
-            np.zeros(self.count, np.int64),
-            np.zeros(self.count, np.int32),
+        self._pairs = Pairs(
+            np.zeros(self.capacity, np.int64),
+            np.zeros(self.capacity, np.int64),
+            np.zeros(self.capacity, np.int32),
             np.empty(room, np.uint32),
             np.empty((4, room), np.float32),
         )
 
+    def _fit_pairs(self):
+        lists = {name: getattr(self._pairs, name)[: self.count] for name in Pairs._fields[:3]}
+        self.pairs = self._pairs._replace(**lists)
+
     def enlarge_pairs(self):
         """More room for neighbours, after a search that found too little."""
         self._allocate_pairs(2 * self.pairs_per_particle)
+        self._fit_pairs()
+
+
+#: Fields of `Contacts` with a row per particle.
+_PER_PARTICLE = ("start", "end", "density", "gradients")
 
 
 def make_grid(lower, upper, cell, count):
