@@ -435,6 +435,29 @@ def test_clock_mode_follows_the_clock_and_starts_over_when_it_jumps_back(scene_p
         assert "jumped back" in output
 
 
+def test_clouds_grow_and_shrink_with_emitters_and_sinks(tmp_path):
+    path = tmp_path / "fountain.yaml"
+    path.write_text(
+        SCENE
+        + "emitters:\n  - {position: [0.03, 0.03, 0.2], radius: 0.02, speed: 1, until: 0.15}\n"
+        + "sinks:\n  - {box: {min: [0.08, 0, 0], max: [0.12, 0.12, 0.12]}, from: 0.05}\n"
+    )
+    sim, counts = Simulation(str(path)), []
+    with RosSession("drinker") as ros:
+        client = FluidClient(ros, f"scene:={path}", "step_mode:=lockstep", f"publish_rate:={RATE}")
+        for step in range(10):
+            position, stamp = stir(step)
+            cloud = cdr_to_particle_cloud(client.turn(position, stamp))
+            sim.move_solid("ball", position, UPRIGHT, time=sim.time + 1.0 / RATE)
+            for _ in range(4):
+                sim.step()
+            assert np.array_equal(cloud.ids, sim.ids)
+            assert np.array_equal(cloud.positions, sim.positions)
+            counts.append(len(cloud.ids))
+    changes = np.diff(counts)
+    assert changes.max() > 0 > changes.min() and max(sim.ids) >= 144
+
+
 # ---------------------------------------------------------------- no liquid, mistakes, faults
 
 

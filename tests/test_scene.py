@@ -17,7 +17,7 @@ from sph_ros.sim.scene import (
     load_scene,
     scene_path,
 )
-from sph_ros.sim.shapes import Box, Container, Difference, Mesh, Sphere
+from sph_ros.sim.shapes import Box, Container, Difference, Mesh, Plane, Sphere
 
 POOL = {
     "spacing": 0.02,
@@ -102,8 +102,7 @@ def test_file_and_dict_with_the_same_keys_make_the_same_scene(tmp_path):
     assert isinstance(from_file.solids[0].shape, Container)
 
 
-def test_everything_a_scene_can_say_arrives(monkeypatch):
-    monkeypatch.setattr("sph_ros.sim.scene_types.EMITTERS_AVAILABLE", True)
+def test_everything_a_scene_can_say_arrives():
     scene = load_scene(
         {
             "name": "all",
@@ -126,6 +125,11 @@ def test_everything_a_scene_can_say_arrives(monkeypatch):
                     "limit": 10,
                 }
             ],
+            "sinks": [
+                {"plane": {"offset": -1}, "from": 2},
+                {"box": {"size": [1, 1, 1]}, "pose": {"position": [0, 0, 3]}, "until": 4},
+            ],
+            "max_particles": 500,
             "solids": [
                 {
                     "name": "stirrer",
@@ -157,6 +161,8 @@ def test_everything_a_scene_can_say_arrives(monkeypatch):
     emitter = scene.emitters[0]
     assert (emitter.from_time, emitter.until, emitter.limit) == (0.5, 2.0, 10)
     assert emitter.direction == (0.0, 0.0, -1.0)
+    assert isinstance(scene.sinks[0].shape, Plane) and scene.max_particles == 500
+    assert [(sink.from_time, sink.until) for sink in scene.sinks] == [(2.0, math.inf), (0.0, 4.0)]
     stirrer, cup = scene.solids
     assert stirrer.path[1].quat_xyzw == (0.0, 0.0, 1.0, 0.0) and stirrer.color == (1.0, 0.5, 0.0)
     assert isinstance(cup.shape, Difference) and not cup.visible
@@ -329,7 +335,19 @@ def test_refused_dicts():
     assert "expected a list" in message(changed("solids", {"name": "a"}))
     assert "keyframes" in message(changed("solids", 1, "control", "path"))
     assert "neither" in message(changed("emitters", [{"position": [0, 0, 0], "radius": 0.1}]))
-    assert "yet" in message(changed("emitters", [{"position": [0, 0, 0], "speed": 1}]))
+    jet = {"position": [0, 0, 0.05], "radius": 0.05, "speed": 1}
+    assert "inside solid 'ball'" in message(
+        changed("emitters", [{**jet, "position": [0.15, 0.05, 0.1], "radius": 0.01}])
+    )
+    assert "emitters[0].rate: 2000 particles/s" in message(
+        changed("emitters", [{**jet, "rate": 2000}])
+    )
+    assert "x-z plane" in message(
+        {**POOL, "dimension": 2, "emitters": [{**jet, "direction": [0, 1, 0]}]}
+    )
+    assert "more than from" in message(changed("emitters", [{**jet, "from": 2, "until": 1}]))
+    assert "columns" in message(changed("emitters", [{**jet, "radius": 99}]))
+    assert "expected one of box" in message(changed("sinks", [{"mesh": {"file": "a.obj"}}]))
     assert "<dict>: liquid[0]" in message(changed("liquid", 0, {"plane": {}}))
     assert "text" in message(changed("solids", 1, {"name": "m", "mesh": {"file": 3}}))
 

@@ -75,6 +75,8 @@ class Emitters:
                 room = min(room, emitter.limit - self._counts[index])
             while room > 0:
                 due = np.flatnonzero(progress >= 1.0)
+                if not len(due):
+                    break
                 # What was due before the last call could not come out then: it does now, and no
                 # farther out than a particle that became due at that call.
                 late = np.minimum((progress[due] - 1.0) * jet.period, end - begin) + now - end
@@ -98,6 +100,5 @@ class Emitters:
         taken = np.zeros(len(places), bool)
         mark_taken(places.astype(np.float32), fluid.positions, np.float32(NEAREST * spacing), taken)
         for solid in solids:
-            if len(places):
-                taken |= solid.signed_distance(places) < NEAREST_SOLID * spacing
+            taken |= solid.signed_distance(places) < NEAREST_SOLID * spacing
         return ~taken
