@@ -149,7 +149,7 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
 @parallel_kernel
 def correct_pressures(
     pairs,
-    sums,
+    densities,
     contact_gradients,
     displacements,
     diagonal,
@@ -166,7 +166,8 @@ def correct_pressures(
     Teboulle 2009): both sides of the equation are the gradient of a convex function.
 
     Args:
-        pairs, sums: from `sum_densities`.
+        pairs: from `sum_densities`.
+        densities: at the displacements zero, relative to rest [-], (N,).
         contact_gradients: as in `cohesive_displacements`.
         displacements: by the present guesses [m], (N, 3).
         diagonal: from `pressure_diagonal`.
@@ -199,7 +200,7 @@ def correct_pressures(
                     + gz[k] * (z - displacements[j, 2])
                 )
             pressure = guesses[i]
-            residual = sums.density[i] - np.float32(1.0) + change - compliance * pressure
+            residual = densities[i] - np.float32(1.0) + change - compliance * pressure
             better = max(pressure + share * residual / diagonal[i], np.float32(0.0))
             guesses[i] = max(better + momentum * (better - pressures[i]), np.float32(0.0))
             pressures[i] = better

@@ -7,6 +7,7 @@ another order. Both are right, but their last bits differ. So no process that si
 the first one has a child do it, and then loads what all later ones load.
 """
 
+import itertools
 import os
 import subprocess
 import sys
@@ -69,10 +70,11 @@ def ensure_compiled():
 
 def main():
     """Take every way through the kernels once, then leave the mark."""
+    from sph_ros.sim.scene_types import SOLVERS
     from sph_ros.sim.simulation import Simulation
 
-    for dimension in (3, 2):
-        simulation = Simulation({**_SCENE, "dimension": dimension})
+    for dimension, solver in itertools.product((3, 2), SOLVERS):
+        simulation = Simulation({**_SCENE, "dimension": dimension, "solver": solver})
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
         simulation.step()
         simulation.set_material(viscosity=0.001)

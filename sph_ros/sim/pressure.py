@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pressure iterations of the relaxation solver."""
+"""The pressure iterations that the solvers `relaxation` and `incompressible` share."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +19,29 @@ SHRINK, GROW = 0.7, 1.01
 FIRST_INERTIA = 4.0
 
 
-def solve_pressures(work, gradients, compliance, goal, share):
+class Goal(NamedTuple):
+    """When iterations end: at a share of the first error, but between two bounds.
+
+    Attributes:
+        least, most: mean density error [-].
+        share: of the error that the first guess leaves [-].
+    """
+
+    least: float
+    share: float = 0.0
+    most: float = np.inf
+
+
+def solve_pressures(work, densities, gradients, compliance, goal, share):
     """Scaled pressures that hold the density, and the displacements they cause.
 
     Args:
-        work: `Workspace` with pairs, sums, diagonal, cohesive displacements and, in `scaled`, a
-            first guess; `scaled` and `displacements` are written.
+        work: `Workspace` with pairs, diagonal, the displacements without pressure in `cohesive`
+            and, in `scaled`, a first guess; `scaled` and `displacements` are written.
+        densities: without displacement, relative to rest [-], (N,).
         gradients: of the contacts, (N, 6).
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
-        goal: mean density error to reach [-].
+        goal: `Goal`.
         share: of the Jacobi correction to take.
 
     Returns:
@@ -44,7 +60,7 @@ def solve_pressures(work, gradients, compliance, goal, share):
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
         relax.correct_pressures(
             work.pairs,
-            work.sums,
+            densities,
             gradients,
             work.displacements,
             work.diagonal,
@@ -56,7 +72,9 @@ def solve_pressures(work, gradients, compliance, goal, share):
             work.errors,
         )
         error = float(work.errors.sum()) / max(work.count, 1)
-        if iteration >= LEAST_ITERATIONS and error <= goal:
+        if iteration == 1:
+            enough = min(max(goal.least, goal.share * error), goal.most)
+        if iteration >= LEAST_ITERATIONS and error <= enough:
             break
         if error > 3.0 * best:
             share = max(SHRINK * share, LEAST_SHARE)

@@ -3,51 +3,24 @@
 
 import numpy as np
 
-from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import relaxation as relax
-from sph_ros.core.weights import DENSITY_POWER
-from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
-from sph_ros.sim.scales import packing, solver_scales, stable_time_step
-from sph_ros.sim.solver import Solver
-from sph_ros.sim.viscosity import apply_viscosity
+from sph_ros.sim.pressure import Goal
+from sph_ros.sim.pressure_solver import PressureSolver
+from sph_ros.sim.scales import packing
 
 #: Pressure iterations end when the mean density error is below this share of the allowed
 #: compression. Looser, the errors keep a tank at rest in motion.
 TOLERANCE = 0.02
 
-#: Viscosity between liquid and a solid that fills the support, as a multiple of that of one
-#: neighbour: (1 - r/h) summed over the layers of the lattice in its place, a third of it along the
-#: wall.
-WALL_LAYERS = 10.0
+#: Share of the support radius that the fastest expected particle crosses in a step.
+COURANT = 0.4
 
 
-class RelaxationSolver(Solver):
+class RelaxationSolver(PressureSolver):
     """Clavet's double density relaxation with the pressure solved implicitly."""
 
-    def __init__(self, scene, solids, depth):
-        """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
-        super().__init__(scene, solids, depth)
-        self._packing = packing(scene, 0.0)
-        self._share = FIRST_SHARE
-
-    def set_material(self, material):
-        """Use another material from the next substep on."""
-        self._material = material
-        self.scales = solver_scales(material, self._scene, self._depth)
-
-    def stable_time_step(self):
-        """A step that keeps the scene stable [s], and what bounds it."""
-        return stable_time_step(self._scene, self.scales, self._depth)
-
-    def state(self):
-        """What a later step depends on beside the fluid, for a snapshot."""
-        return {**super().state(), "share": self._share, "packing": self._packing}
-
-    def set_state(self, state):
-        """Inverse of `state`."""
-        super().set_state(state)
-        self._share, self._packing = state["share"], state["packing"]
+    courant = COURANT
 
     def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
@@ -142,57 +115,18 @@ class RelaxationSolver(Solver):
             time_step,
         )
 
-    def _sum_densities(self):
-        work = self._work
-        search.sum_densities(
-            work.columns,
-            self._h,
-            np.float32(self.scales.density_scale * self._packing),
-            np.float32(self.scales.near_scale),
-            work.contacts.density,
-            work.pairs,
-            work.sums,
-        )
-
-    def _tension(self, unit):
-        return relax.Tension(
-            np.float32(self.scales.cohesion * unit),
-            np.float32(self.scales.near * unit),
-            np.float32(self.scales.near_virial_ratio * self._packing),
-            np.float32(self._material.adhesion),
-        )
-
     def _relax(self, fluid, time_step):
         """Displacements by cohesion and by the pressures that they end up with."""
-        work, scales = self._work, self.scales
-        gradients = work.contacts.gradients
-        unit = time_step**2 / (scales.rest_density * scales.virial * self._packing)
+        work = self._work
+        unit = self._pressure_unit(time_step)
         tension = self._tension(unit)
-        if scales.cohesion > 0.0:
-            ratio = 1.5 * scales.near_scale / (scales.density_scale * self._packing)
-            relax.cohesive_displacements(
-                work.pairs, work.sums, gradients, tension, np.float32(ratio), work.cohesive
-            )
-        else:
-            work.cohesive[:] = 0.0
-        compliance = np.float32(1.0 / (scales.stiffness * unit))
-        relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
+        self._pull_together(tension)
+        compliance = np.float32(1.0 / (self.scales.stiffness * unit))
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
-        goal = TOLERANCE * self._material.compression
-        self.iterations, self.density_error, self._share = solve_pressures(
-            work, gradients, compliance, goal, self._share
-        )
+        goal = Goal(TOLERANCE * self._material.compression)
+        self._iterate(work.sums.density, compliance, goal)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
-        touch.pressure_reactions(
-            work.predicted,
-            work.contacts,
-            self._solids.motion,
-            work.sums,
-            work.scaled,
-            tension,
-            np.float32(scales.mass / time_step**2),
-            work.reactions,
-        )
+        self._react_to_pressures(tension, time_step)
 
     def _finish(self, fluid, time_step):
         """Relaxed positions outside all solids, and the velocities that follow from them."""
@@ -213,28 +147,3 @@ class RelaxationSolver(Solver):
         )
         self.fastest = float(np.sqrt(work.errors.max(initial=0.0)))
         fluid.positions[:] = ends
-
-    def _apply_viscosity(self, fluid, time_step):
-        """Viscosity and friction, which change velocities only."""
-        work, scales = self._work, self.scales
-        slope = DENSITY_POWER * scales.density_scale * self._packing / float(self._h)
-        apply_viscosity(
-            work,
-            fluid.velocities,
-            slope,
-            scales.viscous_rate * time_step,
-            scales.quadratic * time_step,
-        )
-        if len(self._solids):
-            touch.rub_on_solids(
-                work.predicted,
-                work.contacts,
-                self._solids.motion,
-                np.float32(
-                    WALL_LAYERS * self._material.wall_friction * scales.viscous_rate * time_step
-                ),
-                np.float32(self._material.wall_friction * time_step / self._scene.spacing),
-                np.float32(scales.mass / time_step),
-                fluid.velocities,
-                work.reactions,
-            )

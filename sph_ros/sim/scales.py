@@ -50,9 +50,6 @@ MELTING_TIME = 0.5
 #: Stands for sqrt(g H) where gravity does not set a speed [m/s].
 LEAST_SPEED = 0.3
 
-#: Share of the support radius that the fastest expected particle crosses in a step.
-COURANT = 0.4
-
 
 @dataclass(frozen=True)
 class Scales:
@@ -116,7 +113,6 @@ def solver_scales(material, scene, depth):
     virial = gradient_sum(DENSITY_POWER, h, s, d)
     near_virial = gradient_sum(NEAR_POWER, h, s, d)
     cohesion = material.surface_tension / surface_energy(h, s, d)
-    viscous_sum = sum((1 - r / h) * r * r for r, _ in _neighbors(h, s, d))
     return Scales(
         mass=material.density * s**d,
         rest_density=material.density,
@@ -127,9 +123,15 @@ def solver_scales(material, scene, depth):
         density_scale=1.0 / lattice_sum(DENSITY_POWER, h, s, d),
         near_scale=1.0 / lattice_sum(NEAR_POWER, h, s, d),
         near_virial_ratio=virial / near_virial,
-        viscous_rate=2 * d * (d + 2) * material.viscosity / material.density / viscous_sum,
+        viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
     )
+
+
+def viscous_rate(kinematic, scene):
+    """Linear impulse per relative speed and second [1/s] for a kinematic viscosity [m^2/s]."""
+    h, s, d = scene.support_radius, scene.spacing, scene.dimension
+    return 2 * d * (d + 2) * kinematic / sum((1 - r / h) * r * r for r, _ in _neighbors(h, s, d))
 
 
 def surface_energy(support_radius, spacing, dimension):
@@ -166,24 +168,36 @@ def _missing(power, support_radius, spacing, dimension, layer):
     return lacking / lattice_sum(power, support_radius, spacing, dimension)
 
 
-def stable_time_step(scene, scales, drop):
+def expected_speed(scene, drop):
+    """The fastest that the liquid is expected to become by itself [m/s].
+
+    Args:
+        scene: the scene.
+        drop: height that the liquid can fall through [m].
+    """
+    g = math.sqrt(sum(c * c for c in scene.gravity))
+    initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
+    jets = [make_jet(emitter, scene).speed for emitter in scene.emitters]
+    initial = max(initial, max(jets, default=0.0))
+    return max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
+
+
+def stable_time_step(scene, scales, drop, courant):
     """A step that keeps the scene stable [s], and the reason in words.
 
     Args:
         scene: the scene.
         scales: of its material.
         drop: height that the liquid can fall through [m].
+        courant: share of the support radius that the fastest expected particle may cross. The
+            speed also stands for the pressure, so this is the bound of the solver's stiffness.
 
     Returns:
         The step, rounded down to a number people can read, and what bounds it.
     """
     h = scene.support_radius
-    g = math.sqrt(sum(c * c for c in scene.gravity))
-    initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
-    jets = [make_jet(emitter, scene).speed for emitter in scene.emitters]
-    initial = max(initial, max(jets, default=0.0))
-    speed = max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
-    bounds = {f"particles up to {speed:.2g} m/s": COURANT * h / speed}
+    speed = expected_speed(scene, drop)
+    bounds = {f"particles up to {speed:.2g} m/s": courant * h / speed}
     soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)
     if soft > 0:
         bounds["surface tension"] = 0.38 * h / soft

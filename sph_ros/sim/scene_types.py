@@ -20,8 +20,8 @@ from sph_ros.sim.quantities import (
 from sph_ros.sim.shapes import Box, Capsule, Cylinder, Plane, Pose, Shape, Sphere
 
 #: Solvers that exist, and those that are announced but cannot be chosen yet.
-SOLVERS = ("relaxation",)
-PLANNED_SOLVERS = ("forces", "incompressible")
+SOLVERS = ("relaxation", "incompressible")
+PLANNED_SOLVERS = ("forces",)
 
 #: Who moves a solid.
 CONTROLS = ("fixed", "topic", "path")

@@ -69,11 +69,15 @@ class Solver:
 
     def _prepare(self, fluid):
         """Scratch memory that fits, and its running totals at zero."""
+        self._prepare_rows(fluid)
+        self._work.reactions[:] = 0.0
+
+    def _prepare_rows(self, fluid):
+        """Scratch memory that fits."""
         if self._work.capacity < fluid.capacity:
             self._work = Workspace(fluid.capacity, len(self._solids))
         if self._work.count != len(fluid):
             self._work.fit(len(fluid))
-        self._work.reactions[:] = 0.0
 
     def _clock(self, part):
         now = time.perf_counter()

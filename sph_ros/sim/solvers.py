@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solvers by the names that scenes call them."""
 
+from sph_ros.sim.incompressible import IncompressibleSolver
 from sph_ros.sim.relaxation import RelaxationSolver
 
 SOLVER_CLASSES = {
     "relaxation": RelaxationSolver,
+    "incompressible": IncompressibleSolver,
 }

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the incompressible solver does beside the passes that it shares with `relaxation`.
+
+The pressures are those that make the density right after the step (the constant density condition
+of IISPH, Ihmsen et al. 2014, and DFSPH, Bender & Koschier 2015, eq. 9-12): with the gradients g_ij
+of the *present* positions x, the displacement w_i = dt v_i - sum_j (p_i + p_j) g_ij and
+
+    density_i(x + w) <= 1,   p_i >= 0,
+
+one of the two being an equality. The density after the step is linearised about the displacements
+that the last step's pressures would cause, so a step may be long. Forces along the present lines of
+centres and x += w make it a symplectic Euler step: momentum and angular momentum are kept to
+rounding, and it is stable up to sqrt(3) times the step of prediction-relaxation, which pushes along
+predicted lines of centres (a mode of squared frequency k: k dt^2 < 4 against 4/3).
+"""
+
+import numpy as np
+from numba import prange
+
+from sph_ros.core.contacts import (
+    GRADIENT,
+    SURFACE_VELOCITY,
+    to_solid,
+    to_world,
+)
+from sph_ros.core.jit import parallel_kernel
+from sph_ros.core.neighbors import CHUNK
+
+
+@parallel_kernel
+def contact_velocities(positions, motion, inverse_step, contacts):
+    """Velocity of the solids at the contacts: from their old pose to the new one in a step.
+
+    Args:
+        positions: [m], (N, 3), where the contacts were found with the solids at their old pose.
+        motion: poses before and after the step.
+        inverse_step: 1 / dt [1/s], float32.
+        contacts: the surface velocities among `terms` are written.
+    """
+    for i in prange(positions.shape[0]):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        for k in range(contacts.start[i], contacts.end[i]):
+            s = contacts.solid[k]
+            t = contacts.terms[k]
+            lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
+            nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
+            t[SURFACE_VELOCITY] = (nx - x) * inverse_step
+            t[SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
+            t[SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+
+
+@parallel_kernel
+def free_displacements(velocities, gravity, time_step, displacements):
+    """Add to displacements (N, 3) [m] what velocities [m/s] and gravity [m/s^2] make in a step."""
+    for i in prange(velocities.shape[0]):
+        for axis in range(3):
+            velocity = velocities[i, axis] + time_step * gravity[axis]
+            displacements[i, axis] += time_step * velocity
+
+
+@parallel_kernel
+def density_targets(
+    positions,
+    displacements,
+    support_radius,
+    density_scale,
+    pairs,
+    density,
+    contacts,
+    share,
+    time_step,
+    targets,
+):
+    """Densities about which the pressures' part may be taken as linear.
+
+    With t the targets, t_i + sum_j g_ij . (w_i - w_j) is the density after a displacement w, exact
+    at the given displacements and linear in w.
+
+    Args:
+        positions: [m], (N, 3).
+        displacements: expected ones [m], (N, 3).
+        support_radius: h [m], float32.
+        density_scale: 1 / lattice sum of the weight [-], float32.
+        pairs: from `sum_densities` at `positions`.
+        density: at `positions`, relative to rest [-], (N,).
+        contacts: with the solids' velocities.
+        share: of an excess of density that is to be taken back in this step [-], float32. A lack of
+            density counts in full: so far a particle may be approached.
+        time_step: [s], float32.
+        targets: [-], (N,); written.
+    """
+    one, zero = np.float32(1.0), np.float32(0.0)
+    inverse_h = one / support_radius
+    for i in prange(targets.shape[0]):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        ux, uy, uz = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+        grown, linear = zero, zero
+        start, end = pairs.start[i], pairs.end[i]
+        js = pairs.neighbors[start:end]
+        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+        for k in range(js.shape[0]):
+            j = js[k]
+            mx = ux - displacements[j, 0]
+            my = uy - displacements[j, 1]
+            mz = uz - displacements[j, 2]
+            linear += gx[k] * mx + gy[k] * my + gz[k] * mz
+            dx = x - positions[j, 0] + mx
+            dy = y - positions[j, 1] + my
+            dz = z - positions[j, 2] + mz
+            u = one - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
+            u = u if u > zero else zero
+            grown += u * u - us[k] * us[k]
+        excess = density[i] - one
+        if excess > zero:
+            excess *= share
+        for k in range(contacts.start[i], contacts.end[i]):
+            t = contacts.terms[k]
+            for axis in range(3):
+                excess -= time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
+        targets[i] = one + excess + density_scale * grown - linear
+
+
+@parallel_kernel
+def move(positions, displacements, longest, inverse_step, ends, velocities):
+    """Positions and velocities after a step.
+
+    Args:
+        positions, displacements: [m], (N, 3).
+        longest: displacements are cut at this length [m], float32.
+        inverse_step: 1 / dt [1/s], float32.
+        ends: [m], (N, 3); written.
+        velocities: [m/s], (N, 3); written.
+    """
+    for i in prange(positions.shape[0]):
+        x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        scale = np.float32(1.0)
+        if length > longest:
+            scale = longest / length
+        for axis in range(3):
+            step = scale * displacements[i, axis]
+            ends[i, axis] = positions[i, axis] + step
+            velocities[i, axis] = step * inverse_step
+
+
+@parallel_kernel
+def take_stops(starts, origins, wanted, ends, inverse_step, velocities, fastest):
+    """Take out of velocities what solids did not let happen.
+
+    Only the difference goes in: velocities from positions would lose the digits that conserve
+    momentum.
+
+    Args:
+        starts: where particles were [m], (N, 3).
+        origins: the same, but for those that had to be rescued from between solids [m], (N, 3).
+        wanted: where particles wanted to be [m], (N, 3).
+        ends: where the solids let them be [m], (N, 3).
+        inverse_step: 1 / dt [1/s], float32.
+        velocities: [m/s], (N, 3); changed.
+        fastest: largest squared speed of each chunk [m^2/s^2], (chunks,) float64; written.
+    """
+    count = ends.shape[0]
+    for chunk in prange(fastest.shape[0]):
+        most = 0.0
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            square = np.float32(0.0)
+            for axis in range(3):
+                stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
+                velocities[i, axis] += stop * inverse_step
+                square += velocities[i, axis] * velocities[i, axis]
+            most = max(most, square)
+        fastest[chunk] = most

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The incompressible solver: the order of a step."""
+
+import dataclasses
+
+import numpy as np
+
+from sph_ros.core import neighbors as search
+from sph_ros.core import projection as project
+from sph_ros.core import relaxation as relax
+from sph_ros.sim.pressure import Goal
+from sph_ros.sim.pressure_solver import PressureSolver
+from sph_ros.sim.scales import expected_speed, packing, viscous_rate
+
+#: Share of the support radius that the fastest expected particle crosses in a step.
+COURANT = 0.6
+
+#: Share of an excess of density that one step takes back. All of it at once would turn every error
+#: of the iteration into velocity.
+CORRECTED = 0.4
+
+#: Iterations end when the mean density error is this share of what the first guess left, at least
+#: `CALM` and at most 1 times the material's `compression`.
+ERROR_SHARE, CALM = 0.25, 0.05
+
+#: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
+#: Nothing else damps a symplectic step. Liquids that are thicker by themselves get none of it.
+LATTICE_VISCOSITY = 0.005
+
+
+class IncompressibleSolver(PressureSolver):
+    """Pressures that hold the density of the next positions; see `core.projection`."""
+
+    courant = COURANT
+
+    def set_material(self, material):
+        """Use another material from the next substep on."""
+        super().set_material(material)
+        scene = self._scene
+        kinematic = LATTICE_VISCOSITY * scene.spacing * expected_speed(scene, self._depth)
+        least = viscous_rate(kinematic, scene)
+        self.scales = dataclasses.replace(
+            self.scales, viscous_rate=max(self.scales.viscous_rate, least)
+        )
+
+    def step(self, fluid, time, time_step):
+        """Advance `fluid` by one substep; the solids' motion must already be set.
+
+        Args:
+            fluid: changed in place.
+            time: since the start of the simulation [s].
+            time_step: [s].
+
+        Returns:
+            Force [N] and torque [N m] of the liquid on each solid, (S, 6) float64.
+
+        Raises:
+            UnstableError: a position is not a number.
+        """
+        self._clock("start")
+        if self._listed is not fluid:
+            self._make_lists(fluid)
+        work = self._work
+        work.reactions[:] = 0.0
+        project.contact_velocities(
+            work.predicted, self._solids.motion, np.float32(1.0 / time_step), work.contacts
+        )
+        self._apply_viscosity(fluid, time_step)
+        self._clock("viscosity")
+        self._project(fluid, time_step)
+        self._clock("pressure")
+        self._move(fluid, time_step)
+        self._clock("finish")
+        self._packing = packing(self._scene, time + time_step)
+        if self._scene.emitters or self._scene.sinks:
+            self._listed = None  # particles may come and go before the next step
+        else:
+            self._make_lists(fluid)
+        return work.reactions.sum(axis=0)
+
+    def densities(self, fluid):
+        """Densities at the present positions relative to rest [-], (N,), rows as in `fluid`."""
+        if self._listed is not fluid:
+            # Sort a copy: asking must not change the order of sums in later steps.
+            twin = fluid.copy()
+            self._make_lists(twin)
+            return twin.public(self._work.sums.density)[fluid.particle]
+        return self._work.sums.density.copy()
+
+    def _make_lists(self, fluid):
+        """Sort by cell; contacts, neighbours and densities at the present positions."""
+        self._prepare_rows(fluid)
+        work = self._work
+        work.predicted[:] = fluid.positions
+        work.starts[:] = fluid.positions
+        velocities = fluid.velocities.copy()
+        self._sort(fluid)
+        search.gather_rows(work.order, velocities, fluid.velocities)
+        self._clock("sort")
+        self._find_contacts(1.0, fluid.clearance)
+        self._clock("solids")
+        self._find_neighbors()
+        self._clock("neighbors")
+        self._sum_densities()
+        self._clock("densities")
+        self._listed = fluid
+
+    def _project(self, fluid, time_step):
+        """Displacements in this step under all forces, pressures included."""
+        work = self._work
+        unit = self._pressure_unit(time_step)
+        tension = self._tension(unit)
+        self._pull_together(tension)
+        dt = np.float32(time_step)
+        project.free_displacements(fluid.velocities, self._gravity, dt, work.cohesive)
+        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        relax.pressure_displacements(
+            work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.displacements
+        )
+        project.density_targets(
+            work.predicted,
+            work.displacements,
+            self._h,
+            np.float32(self.scales.density_scale * self._packing),
+            work.pairs,
+            work.sums.density,
+            work.contacts,
+            np.float32(CORRECTED),
+            dt,
+            work.targets,
+        )
+        allowed = self._material.compression
+        self._iterate(work.targets, np.float32(0.0), Goal(CALM * allowed, ERROR_SHARE, allowed))
+        np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
+        self._react_to_pressures(tension, time_step)
+
+    def _move(self, fluid, time_step):
+        """New positions, outside all solids, and velocities."""
+        work = self._work
+        inverse_step = np.float32(1.0 / time_step)
+        ends, wanted, origins = work.predicted, work.starts, work.scratch
+        project.move(
+            fluid.positions, work.displacements, self._h, inverse_step, ends, fluid.velocities
+        )
+        wanted[:] = ends
+        origins[:] = fluid.positions
+        solids = self._solids
+        self._keep_outside(
+            fluid.positions,
+            ends,
+            origins,
+            fluid.clearance,
+            solids.travel,
+            solids.motion,
+            time_step,
+        )
+        project.take_stops(
+            fluid.positions, origins, wanted, ends, inverse_step, fluid.velocities, work.errors
+        )
+        self.fastest = float(np.sqrt(work.errors.max(initial=0.0)))
+        fluid.positions[:] = ends
