@@ -86,7 +86,7 @@ def test_packing_goes_from_the_lattice_to_flowed_liquid():
 def test_the_step_is_shorter_for_what_is_faster_finer_or_tauter():
     def step(material=MATERIALS["water"], **changes):
         scene = dataclasses.replace(load_scene("resting_column"), **changes)
-        return stable_time_step(scene, solver_scales(material, scene, 0.2), 0.2)
+        return stable_time_step(scene, solver_scales(material, scene, 0.2), 0.2, courant=0.4)
 
     base, reason = step()
     assert reason.startswith("particles up to 2")
