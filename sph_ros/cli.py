@@ -39,6 +39,7 @@ def main(argv=None):
 def _user_errors():
     """What people can cause; each carries one line that says how to mend it."""
     from msg_adapters.bags import BagError
+    from sph_ros.sim.guards import UnstableError
     from sph_ros.sim.scene_yaml import SceneError
     from sph_ros.simulate import SimulateError
     from sph_ros.tracking.calibration import CalibrationError
@@ -47,7 +48,7 @@ def _user_errors():
     from sph_ros.tracking.targets import TargetError
 
     tracking = CalibrationError, CommandError, DictionaryError, TargetError
-    return SceneError, BagError, SimulateError, *tracking
+    return SceneError, BagError, SimulateError, UnstableError, *tracking
 
 
 def _parser():
@@ -143,6 +144,8 @@ def _check(options):
     print(f"solver:    {scene.solver}, {scene.dimension}D")
     print(f"time step: {sim.time_step * 1e3:.3g} ms ({chosen})")
     print(f"solids:    {solids}")
+    for note in sim.notes:
+        print(f"note:      {note}")
     print(f"memory:    about {needed / 1e6:,.0f} MB of {available_memory() / 1e6:,.0f} MB")
     return 0
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sph_ros.sim.materials import RANGES
+from sph_ros.sim.materials import MATERIALS, RANGES
 from sph_ros.sim.scene import list_scenes
 from sph_ros.sim.share import share_folder
 
@@ -112,3 +112,13 @@ def test_the_readme_names_every_program_scene_and_parameter():
         assert dict(rows)[f"material.{field}"].strip().replace(",", "") == f"{low:g} to {high:g}"
     for picture in re.findall(r"\]\((docs/\w+\.png)\)", readme):
         assert 10_000 < (ROOT / picture).stat().st_size < 400_000
+
+
+def test_the_table_of_materials_says_what_the_code_says():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    section = readme.partition("## Materials")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|(.*)\|$", section, re.MULTILINE)
+    fields = ("density", "viscosity", "surface_tension", "compression", "wall_friction", "adhesion")
+    table = {name: [float(cell) for cell in cells.split("|")] for name, cells in rows}
+    expected = {name: [getattr(m, field) for field in fields] for name, m in MATERIALS.items()}
+    assert table == expected

@@ -330,7 +330,7 @@ def test_refused_dicts():
     assert "neither" in message({"spacing": 0.01})
     assert "expected 3 numbers" in message(changed("gravity", -9.81))
     assert "expected a number" in message(changed("spacing", True))
-    assert "1.2 to 4" in message(changed("support_radius", 0.2))
+    assert "1.6 to 4" in message(changed("support_radius", 0.2))
     assert "expected 2 or 3" in message(changed("dimension", 4))
     assert "expected a list" in message(changed("solids", {"name": "a"}))
     assert "keyframes" in message(changed("solids", 1, "control", "path"))

@@ -211,12 +211,12 @@ def correct_pressures(
 
 
 @parallel_kernel
-def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
+def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, changed):
     """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
 
     The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also
-    press. The quadratic one acts on approaching pairs. No pair gives more than half its relative
-    speed.
+    press. The quadratic one acts on approaching pairs. All neighbours act at once, so each may take
+    only so much of a relative speed that together they do not overshoot: that is `most`.
 
     Args:
         pairs: from `sum_densities`.
@@ -224,9 +224,9 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
         slope: length of a pair's gradient divided by (1 - r/h) [1/m], float32.
         linear: impulse per relative speed, time step included [-], float32.
         quadratic: impulse per squared relative speed, time step included [s/m], float32.
+        most: share of the relative speed that a pair at zero distance may take [-], float32.
         changed: velocities afterwards [m/s], (N, 3); written.
     """
-    half = np.float32(0.5)
     zero = np.float32(0.0)
     inverse_slope2 = np.float32(1.0) / (slope * slope)
     for i in prange(velocities.shape[0]):
@@ -247,7 +247,7 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, changed):
             )
             inverse_u = np.float32(1.0) / (u + np.float32(1e-3))
             approach = max(along, zero) * inverse_u / slope
-            share = min(linear * u + quadratic * u * approach, half)
+            share = u * min(linear + quadratic * approach, most)
             c = share * along * inverse_u * inverse_u * inverse_slope2
             ax -= c * gx[k]
             ay -= c * gy[k]

@@ -112,6 +112,8 @@ class FluidNode(Node):
             f"{sim.scene.name}: {sim.particle_count} particles{more}, "
             f"step {sim.time_step * 1e3:.3g} ms ({sim.time_step_reason}), {self._step_mode}"
         )
+        for note in sim.notes:
+            self.get_logger().warning(note)
 
     def _make_driver(self):
         if self._step_mode == "lockstep":

@@ -39,7 +39,7 @@ class Emitters:
     def state(self):
         """What a later step depends on, for a snapshot."""
         progress = [columns.tolist() for columns in self._progress]
-        return {"progress": progress, "counts": self._counts, "now": self._now}
+        return {"progress": progress, "counts": list(self._counts), "now": self._now}
 
     def set_state(self, state):
         """Inverse of `state`."""

@@ -40,21 +40,63 @@ class Material:
 #: Field -> (lowest, highest) accepted value; also the ranges of the ROS parameters.
 RANGES = limits_of(Material)
 
+#: The packaged liquids at 20 degrees centigrade. Adhesion is what Young & Dupre make of the contact
+#: angle on ordinary plastic or glass: (1 + cos angle) / 2, so 0.5 stands for 90 degrees and 0.1 for
+#: mercury's 140. Friction: thick liquids stick to what they touch, mercury does not wet it.
 MATERIALS = {
     material.name: material
     for material in (
-        Material(),
-        Material("oil", density=910.0, viscosity=0.08, surface_tension=0.033, wall_friction=0.5),
-        Material("honey", density=1420.0, viscosity=8.0, surface_tension=0.05, wall_friction=1.0),
-        Material("cream", density=1000.0, viscosity=2.0, surface_tension=0.05, wall_friction=0.9),
-        Material("mercury", density=13_534.0, viscosity=0.00155, surface_tension=0.485),
+        Material("water"),
+        Material(
+            "oil",  # olive oil
+            density=910.0,
+            viscosity=0.08,
+            surface_tension=0.033,
+            compression=0.01,
+            wall_friction=0.5,
+            adhesion=0.9,
+            quadratic_viscosity=0.3,
+        ),
+        Material(
+            "honey",
+            density=1420.0,
+            viscosity=8.0,
+            surface_tension=0.05,
+            compression=0.01,
+            wall_friction=1.0,
+            adhesion=0.8,
+            quadratic_viscosity=0.3,
+        ),
+        Material(
+            "cream",
+            density=1000.0,
+            viscosity=2.0,
+            surface_tension=0.045,
+            compression=0.01,
+            wall_friction=0.9,
+            adhesion=0.8,
+            quadratic_viscosity=0.3,
+        ),
+        Material(
+            "mercury",
+            density=13_534.0,
+            viscosity=0.00155,
+            surface_tension=0.485,
+            compression=0.01,
+            wall_friction=0.0,
+            adhesion=0.1,
+            quadratic_viscosity=0.3,
+        ),
+        # Not a gas, it keeps its volume; but light, without viscosity, tension or grip. Game
+        # fluids of the 2000s that left the viscosity out behaved like this.
         Material(
             "air_like",
-            density=1000.0,
+            density=1.2,
             viscosity=0.0,
             surface_tension=0.0,
             compression=0.05,
             wall_friction=0.0,
+            adhesion=0.0,
             quadratic_viscosity=0.0,
         ),
     )

@@ -51,6 +51,25 @@ class PressureSolver(Solver):
         super().set_state(state)
         self._share, self._packing = state["share"], state["packing"]
 
+    def pressures(self, fluid):
+        """Pressures of the last substep [Pa], (N,) float32, rows as in `fluid`.
+
+        That of the density and those that make surface tension, p + Kc (density - 1) + Kn
+        (near_density - 1): in the bulk, the virial of all pairs (see `scales`).
+        """
+        if self._listed is not fluid or self._work.count != len(fluid):
+            twin = fluid.copy()
+            self._make_lists(twin)
+            self._sum_densities()
+            return twin.public(self.pressures(twin))[fluid.particle]
+        sums, scales = self._work.sums, self.scales
+        cohesive = scales.cohesion * (sums.density - 1.0) + scales.near * (sums.near_density - 1.0)
+        return fluid.pressures + cohesive.astype(np.float32)
+
+    def stages(self):
+        """What the last substep made, in order."""
+        return [*super().stages(), ("its pressure", self._work.scaled)]
+
     def _pressure_unit(self, time_step):
         """Scaled pressure [m^2] per pressure [Pa]: dt^2 / (rho0 virial)."""
         return time_step**2 / (self.scales.rest_density * self.scales.virial * self._packing)
@@ -124,6 +143,7 @@ class PressureSolver(Solver):
             slope,
             scales.viscous_rate * time_step,
             scales.quadratic * time_step,
+            scales.neighbors,
         )
         if len(self._solids):
             touch.rub_on_solids(

@@ -65,6 +65,7 @@ class Scales:
         near_virial_ratio: G / Gn, so that both pressures cancel at rest [-].
         viscous_rate: linear impulse per relative speed and second [1/s].
         quadratic: quadratic impulse per squared relative speed and second [1/m].
+        neighbors: (1 - r/h) summed over the lattice's neighbours, divided by the dimension [-].
     """
 
     mass: float
@@ -78,6 +79,7 @@ class Scales:
     near_virial_ratio: float
     viscous_rate: float
     quadratic: float
+    neighbors: float
 
 
 def packing(scene, time):
@@ -125,6 +127,7 @@ def solver_scales(material, scene, depth):
         near_virial_ratio=virial / near_virial,
         viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
+        neighbors=sum(1 - r / h for r, _ in _neighbors(h, s, d) if r > 0.0) / d,
     )
 
 

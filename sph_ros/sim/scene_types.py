@@ -251,10 +251,11 @@ class Scene:
             replace_fields(self, max_particles=int(self.max_particles))
         if self.support_radius is None:
             replace_fields(self, support_radius=2.0 * self.spacing)
-        low, high = 1.2 * self.spacing, 4.0 * self.spacing
+        # With fewer neighbours a liquid at rest boils; with more, solids and corners blur.
+        low, high = 1.6 * self.spacing, 4.0 * self.spacing
         if not low <= self.support_radius <= high:
             raise ValueError(
-                f"support_radius: expected {low:g} to {high:g} m (1.2 to 4 spacings), "
+                f"support_radius: expected {low:g} to {high:g} m (1.6 to 4 spacings), "
                 f"got {self.support_radius:g}"
             )
         self._check_names()

@@ -7,6 +7,7 @@ import numpy as np
 
 from sph_ros.core.surface import extract_surface
 from sph_ros.sim.emitters import Emitters
+from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
 from sph_ros.sim.jets import capacity
 from sph_ros.sim.kernels import ensure_compiled
 from sph_ros.sim.liquid import fill_liquid
@@ -43,6 +44,7 @@ class Simulation:
         material: the present material.
         capacity: there are never more particles at once.
         timings: milliseconds of the last step by part.
+        notes: lines about parameters that had to be tamed, for people.
     """
 
     def __init__(self, scene):
@@ -73,6 +75,8 @@ class Simulation:
         self._substeps = 1
         self._reactions = np.zeros((len(self._solids), 6))
         self._densities = None
+        self._guard = Guard()
+        self._fault = None
         self.timings = {}
 
     def _choose_time_step(self):
@@ -84,8 +88,13 @@ class Simulation:
     def _use_material(self, material):
         """Hand a material to the solver; the longest stable substep goes with it."""
         self.material = material
+        used, self.notes = tamed(material, self.scene, self._stable_step_of)
+        self._stable_step, _ = self._stable_step_of(used)
+
+    def _stable_step_of(self, material):
+        """The longest stable step with a material [s], and why; the solver has it from now on."""
         self._solver.set_material(material)
-        self._stable_step, _ = self._solver.stable_time_step()
+        return self._solver.stable_time_step()
 
     # ---------------------------------------------------------------- time
 
@@ -95,7 +104,44 @@ class Simulation:
         return self._steps * self.time_step
 
     def step(self):
-        """Advance by one time step, in as many substeps as the speeds need."""
+        """Advance by one time step, in as many substeps as the speeds need.
+
+        Raises:
+            UnstableError: something is no longer a number; names step, particle, cause and the file
+                with the state before. Nothing is stepped from then on, until `reset`.
+        """
+        if self._fault is not None:
+            raise self._fault
+        self._guard.remember(self._fluid, self._numbers(), self._solids)
+        try:
+            self._step()
+            good = all_numbers(self._fluid.positions, self._fluid.velocities, self._reactions)
+        except UnstableError:
+            good = False
+        if not good:
+            self._fault = self._stop()
+            raise self._fault
+        self._steps += 1
+        self._densities = None
+
+    def _stop(self):
+        """Save the state before the step that failed; the error that says so."""
+        stages = self._solver.stages()
+        particle, cause = self._guard.failure(self._fluid, stages, self._reactions)
+        number = self._steps + 1
+        where = f"step {number} (from {self.time:.6g} s on)"
+        if particle is not None:
+            where += f": particle {particle}"
+            cause = f"{cause}; {self._guard.describe(particle)}"
+        path = rescue_folder() / rescue_name(self.scene.name, number)
+        try:
+            write_snapshot(path, self.scene, self.material, *self._guard.snapshot())
+            kept = f"the state before this step is in {path}"
+        except OSError as error:
+            path, kept = None, f"the state before this step could not be written ({error})"
+        return UnstableError(f"{where}: {cause}; {kept}", number, particle, cause, path)
+
+    def _step(self):
         count = self._substep_count()
         duration = self.time_step / count
         # Solids must not be faster than the liquid can follow.
@@ -111,8 +157,6 @@ class Simulation:
             self._sinks.advance(self._fluid, now + duration)
         self.timings = self._solver.timings
         self._substeps = count
-        self._steps += 1
-        self._densities = None
 
     def _substep_count(self):
         """Substeps that keep solids and particles within their reach, and the liquid stable."""
@@ -148,7 +192,13 @@ class Simulation:
 
     def save(self, path):
         """Write the whole state to one file; `Simulation.load` goes on from it to the bit."""
-        numbers = {
+        numbers = {**self._numbers(), "solids": {s.name: s.state() for s in self._solids}}
+        arrays = {**self._fluid.arrays(), "densities": self._relative_densities()}
+        write_snapshot(path, self.scene, self.material, arrays, numbers)
+
+    def _numbers(self):
+        """What a snapshot holds beside arrays and solids."""
+        return {
             "steps": self._steps,
             "time_step": [self.time_step, self.time_step_reason],
             "substeps": self._substeps,
@@ -157,10 +207,7 @@ class Simulation:
             "next_id": self._next_id,
             "emitters": self._emitters.state(),
             "sinks": self._sinks.state(),
-            "solids": {solid.name: solid.state() for solid in self._solids},
         }
-        arrays = {**self._fluid.arrays(), "densities": self._relative_densities()}
-        write_snapshot(path, self.scene, self.material, arrays, numbers)
 
     @classmethod
     def load(cls, path):
@@ -209,6 +256,11 @@ class Simulation:
         """Densities at the present positions [kg/m^3], (N,) float32; a copy."""
         relative = self._relative_densities()
         return self._fluid.public(relative * np.float32(self.material.density))
+
+    @property
+    def pressures(self):
+        """Pressures of the last step [Pa], surface tension's own included, (N,) float32; a copy."""
+        return self._fluid.public(self._solver.pressures(self._fluid))
 
     @property
     def ids(self):

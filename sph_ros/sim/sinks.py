@@ -51,7 +51,9 @@ class Sinks:
         self.removed += int(taken.sum())
         farthest = self._farthest()
         if np.abs(fluid.positions).max(initial=0.0) > farthest:
-            far = (np.abs(fluid.positions) > farthest).any(axis=1) & ~taken
+            # What is infinite has exploded, not flown away: it stays for the simulation to stop at.
+            distance = np.abs(fluid.positions).max(axis=1)
+            far = (distance > farthest) & np.isfinite(distance) & ~taken
             self.lost += int(far.sum())
             taken |= far
         if taken.any():

@@ -8,14 +8,11 @@ import numpy as np
 
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
+from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.state import Workspace, make_grid
 
 #: Distance that particles keep from solids, as a share of the spacing.
 MARGIN = 0.05
-
-
-class UnstableError(RuntimeError):
-    """A position or velocity is no longer a number."""
 
 
 class Solver:
@@ -52,6 +49,21 @@ class Solver:
     def longest_step(self):
         """The longest substep [s] that the present accelerations allow."""
         return math.inf
+
+    def pressures(self, fluid):
+        """Pressures of the last substep [Pa], (N,) float32, rows as in `fluid`."""
+        return fluid.pressures
+
+    def stages(self):
+        """What the last substep made, in the order it did: [(words, rows as in the fluid)].
+
+        When something is no number, the first of them that shows it is named as the cause.
+        """
+        return [
+            ("its predicted position", self._work.predicted),
+            ("its density", self._work.sums.density),
+            ("the push of solids on it", self._work.contacts.gradients),
+        ]
 
     def state(self):
         """What a later step depends on beside the fluid, for a snapshot."""

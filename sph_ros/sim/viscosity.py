@@ -5,13 +5,16 @@ import numpy as np
 
 from sph_ros.core import relaxation as relax
 
-#: Above this linear impulse per relative speed explicit viscosity would overshoot.
-EXPLICIT_LIMIT = 0.15
+#: Share of its speed relative to all neighbours that a particle may lose explicitly in a step. A
+#: pair takes a share c along its line, so N neighbours all around take N c / dimension; from 1 on
+#: they overshoot. Above the first limit the linear part is solved implicitly; the quadratic part
+#: is cut at the second.
+EXPLICIT_LIMIT, MOST_TAKEN = 0.38, 0.5
 
 TOLERANCE, MOST_ITERATIONS = 1e-4, 100
 
 
-def apply_viscosity(work, velocities, slope, linear, quadratic):
+def apply_viscosity(work, velocities, slope, linear, quadratic, neighbors):
     """Let pairs of neighbours share their velocities.
 
     Args:
@@ -20,8 +23,9 @@ def apply_viscosity(work, velocities, slope, linear, quadratic):
         slope: length of a pair's gradient divided by (1 - r/h) [1/m].
         linear: impulse per relative speed in this step [-].
         quadratic: impulse per squared relative speed in this step [s/m].
+        neighbors: (1 - r/h) summed over the neighbours in a lattice, by the dimension [-].
     """
-    implicit = linear > EXPLICIT_LIMIT
+    implicit = linear * neighbors > EXPLICIT_LIMIT
     if quadratic > 0.0 or (linear > 0.0 and not implicit):
         relax.viscous_impulses(
             work.pairs,
@@ -29,6 +33,7 @@ def apply_viscosity(work, velocities, slope, linear, quadratic):
             np.float32(slope),
             np.float32(0.0 if implicit else linear),
             np.float32(quadratic),
+            np.float32(MOST_TAKEN / neighbors),
             work.scratch,
         )
         velocities[:] = work.scratch
