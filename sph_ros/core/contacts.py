@@ -5,83 +5,33 @@ A contact is one particle near one solid. All solids around a particle act toget
 rule of `walls`: the liquid's share of the support is the product of what each solid leaves free.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import prange
 
+from sph_ros.core.contact_data import (
+    DISTANCE,
+    FRACTION,
+    GRADIENT,
+    NEAR_FRACTION,
+    NEAR_GRADIENT,
+    NORMAL,
+    SURFACE_VELOCITY,
+    TERMS,
+    Contacts,
+    Motion,
+    add_reaction,
+    rotate,
+    to_solid,
+    to_world,
+    write_surface_velocity,
+)
 from sph_ros.core.distances import distance_and_normal, signed_distance
 from sph_ros.core.jit import device, inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.sheet_contacts import add_sheet_contacts
 from sph_ros.core.walls import wall_terms
 
-#: Columns of `Contacts.terms`.
-FRACTION, NEAR_FRACTION, GRADIENT, NEAR_GRADIENT, NORMAL, SURFACE_VELOCITY = 0, 1, 2, 5, 8, 11
-TERMS = 14
-
-
-class Motion(NamedTuple):
-    """Where the solids are at the start and at the end of a substep.
-
-    Attributes:
-        old_position, position: origins, world frame [m], (S, 3) float32.
-        old_rotation, rotation: world from solid, (S, 3, 3) float32.
-    """
-
-    old_position: np.ndarray
-    old_rotation: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-
-
-class Contacts(NamedTuple):
-    """Contacts of particle i are rows start[i]:end[i].
-
-    Attributes:
-        start, end: (N,) int64.
-        solid: (K,) int32.
-        terms: the columns named above, world frame; gradients already include the other solids'
-            share and are [1/m], the surface's velocity [m/s], (K, TERMS) float32.
-        density: density and near-density that all solids add to particle i [-], (N, 2).
-        gradients: sums of the gradients over the contacts [1/m], (N, 6).
-    """
-
-    start: np.ndarray
-    end: np.ndarray
-    solid: np.ndarray
-    terms: np.ndarray
-    density: np.ndarray
-    gradients: np.ndarray
-
-
-@inlined
-def to_solid(rotation, origin, s, x, y, z):
-    """World point in the frame of solid s."""
-    dx, dy, dz = x - origin[s, 0], y - origin[s, 1], z - origin[s, 2]
-    r = rotation[s]
-    return (
-        r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
-        r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
-        r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
-    )
-
-
-@inlined
-def rotate(rotation, s, x, y, z):
-    """World direction of a direction in the frame of solid s."""
-    r = rotation[s]
-    return (
-        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
-        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
-    )
-
-
-@inlined
-def to_world(rotation, origin, s, x, y, z):
-    """World point of a point in the frame of solid s."""
-    wx, wy, wz = rotate(rotation, s, x, y, z)
-    return wx + origin[s, 0], wy + origin[s, 1], wz + origin[s, 2]
+__all__ = ["TERMS", "Contacts", "Motion"]
 
 
 @inlined
@@ -104,11 +54,8 @@ def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
         terms[row, column] = wx
         terms[row, column + 1] = wy
         terms[row, column + 2] = wz
-    # The point of the solid that is now here was there before the substep.
-    ox, oy, oz = to_world(motion.old_rotation, motion.old_position, s, lx, ly, lz)
-    terms[row, SURFACE_VELOCITY] = (x - ox) * inverse_step
-    terms[row, SURFACE_VELOCITY + 1] = (y - oy) * inverse_step
-    terms[row, SURFACE_VELOCITY + 2] = (z - oz) * inverse_step
+    terms[row, DISTANCE] = found[0]
+    write_surface_velocity(motion, s, lx, ly, lz, x, y, z, inverse_step, terms, row)
     return True, found[0]
 
 
@@ -139,11 +86,11 @@ def combine_contacts(contacts, packing, i, begin, end):
 
 @device
 def find_contacts_of_chunk(
-    chunk, positions, clearance, shapes, motion, inverse_step, packing, contacts
+    chunk, positions, clearance, shapes, sheets, motion, inverse_step, packing, slots, contacts
 ):
     """`find_contacts` for one chunk of particles; a function of its own compiles faster."""
     solids = motion.position.shape[0]
-    cursor = chunk * CHUNK * solids
+    cursor = chunk * CHUNK * slots
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         contacts.start[i] = cursor
@@ -156,13 +103,30 @@ def find_contacts_of_chunk(
                 nearest = min(nearest, distance)
                 if near:
                     cursor += 1
+            for k in range(sheets.solid.shape[0]):
+                rows, distance = add_sheet_contacts(
+                    shapes, sheets, k, motion, x, y, z, inverse_step, contacts, cursor
+                )
+                nearest = min(nearest, distance)
+                cursor += rows
             clearance[i] = nearest
         contacts.end[i] = cursor
         combine_contacts(contacts, packing, i, contacts.start[i], cursor)
 
 
 @parallel_kernel
-def find_contacts(positions, clearance, shapes, motion, inverse_step, packing, chunks, contacts):
+def find_contacts(
+    positions,
+    clearance,
+    shapes,
+    sheets,
+    motion,
+    inverse_step,
+    packing,
+    chunks,
+    slots,
+    contacts,
+):
     """Contacts of all particles with the solids at the end of the substep.
 
     Args:
@@ -170,31 +134,28 @@ def find_contacts(positions, clearance, shapes, motion, inverse_step, packing, c
         clearance: for each particle a distance that it certainly has from all solids [m], (N,);
             where that is not enough to do without a look it is written anew.
         shapes: packed shapes of the S solids.
+        sheets: those of them that are sheets.
         motion: poses of the solids.
         inverse_step: 1 / substep [1/s], float32.
         packing: rest density of the lattice over that of the liquid (`scales.packing`) [-],
             float32.
         chunks: `chunk_count(N)`.
-        contacts: all written; needs room for chunks * CHUNK * S contacts.
+        slots: most contacts of a particle, S and two for each sheet.
+        contacts: all written; needs room for chunks * CHUNK * slots contacts.
     """
     for chunk in prange(chunks):
         find_contacts_of_chunk(
-            chunk, positions, clearance, shapes, motion, inverse_step, packing, contacts
+            chunk,
+            positions,
+            clearance,
+            shapes,
+            sheets,
+            motion,
+            inverse_step,
+            packing,
+            slots,
+            contacts,
         )
-
-
-@inlined
-def add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz):
-    """Add a force at a world point to the wrench on solid s about its origin."""
-    rx = x - motion.position[s, 0]
-    ry = y - motion.position[s, 1]
-    rz = z - motion.position[s, 2]
-    reactions[chunk, s, 0] += fx
-    reactions[chunk, s, 1] += fy
-    reactions[chunk, s, 2] += fz
-    reactions[chunk, s, 3] += ry * fz - rz * fy
-    reactions[chunk, s, 4] += rz * fx - rx * fz
-    reactions[chunk, s, 5] += rx * fy - ry * fx
 
 
 @parallel_kernel

@@ -46,7 +46,7 @@ _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 
 #: Rows of the flat wall's two readings in the tables.
-_MIRRORED, _COVERED = 0, 1
+MIRRORED, COVERED = 0, 1
 
 
 @inlined
@@ -79,7 +79,7 @@ def slab_factor(shapes, half, coordinate, facing):
     """
     u = abs(coordinate)
     side = sign_of(coordinate)
-    table = _MIRRORED if facing else _COVERED
+    table = MIRRORED if facing else COVERED
     far = u if facing else u + half
     cf, cg = _ONE / shapes.full_cover[0], _ONE / shapes.full_cover[1]
     f0, df0, g0, dg0 = wall_share(shapes, table, u - half)
@@ -92,8 +92,8 @@ def gap_factor(shapes, half, coordinate):
     """One axis's factor of a container: the free share between its sides, as `slab_factor`."""
     u = abs(coordinate)
     side = sign_of(coordinate)
-    f0, df0, g0, dg0 = wall_share(shapes, _MIRRORED, half - u)
-    f1, df1, g1, dg1 = wall_share(shapes, _MIRRORED, half + u)
+    f0, df0, g0, dg0 = wall_share(shapes, MIRRORED, half - u)
+    f1, df1, g1, dg1 = wall_share(shapes, MIRRORED, half + u)
     f0, f1, g0, g1 = _ONE - f0, _ONE - f1, _ONE - g0, _ONE - g1
     return f0 * f1, side * (df0 * f1 - f0 * df1), g0 * g1, side * (dg0 * g1 - g0 * dg1)
 
@@ -214,7 +214,7 @@ def grid_terms(shapes, node, x, y, z, inverted):
     grid = shapes.node_grid[node]
     sign = -_ONE if inverted else _ONE
     d, nx, ny, nz = grid_distance(shapes, grid, x, y, z)
-    f, df, g, dg = wall_share(shapes, _MIRRORED, d * sign)
+    f, df, g, dg = wall_share(shapes, MIRRORED, d * sign)
     df, dg = df * sign, dg * sign
     i, u, ex = grid_place(shapes, grid, 0, x)
     j, v, ey = grid_place(shapes, grid, 1, y)
@@ -266,7 +266,7 @@ def leaf_terms(shapes, node, x, y, z):
     elif op == CYLINDER:
         t = cylinder_terms(shapes, node, px, py, pz, inverted)
     elif op == PLANE:
-        t = table_terms(shapes, node, px, py, pz, _MIRRORED, inverted)
+        t = table_terms(shapes, node, px, py, pz, MIRRORED, inverted)
     else:
         t = table_terms(shapes, node, px, py, pz, shapes.node_table[node, 0], inverted)
     f, fx, fy, fz, g, gx, gy, gz = t

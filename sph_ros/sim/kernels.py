@@ -11,6 +11,7 @@ import itertools
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from numba import config
@@ -40,6 +41,9 @@ _SCENE = {
     ],
     "sinks": [{"plane": {"offset": -1.0}}],
 }
+
+#: A triangle in the middle of the liquid.
+_SHEET = "v 0 0 0.05\nv 0.1 0 0.05\nv 0 0.1 0.05\nf 1 2 3"
 
 
 def ensure_compiled():
@@ -74,7 +78,13 @@ def main():
     from sph_ros.sim.simulation import Simulation
 
     for dimension, solver in itertools.product((3, 2), SOLVERS):
-        simulation = Simulation({**_SCENE, "dimension": dimension, "solver": solver})
+        with tempfile.NamedTemporaryFile("w", suffix=".obj") as mesh:
+            scene = {**_SCENE, "dimension": dimension, "solver": solver}
+            if dimension == 3:
+                print(_SHEET, file=mesh, flush=True)
+                surface = {"file": mesh.name, "restitution": 0.5}
+                scene["solids"] = [*_SCENE["solids"], {"name": "sheet", "surface": surface}]
+            simulation = Simulation(scene)
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
         simulation.step()
         simulation.set_material(viscosity=0.001)

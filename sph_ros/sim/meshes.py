@@ -93,8 +93,13 @@ class DistanceGrid:
     bound: tuple[np.ndarray, float]
 
 
-def _read(path: Path):
-    """A trimesh object with all bodies of a file, or MeshError."""
+def read_mesh(path: Path, stream=None):
+    """A trimesh object with all bodies of a file, or MeshError.
+
+    Args:
+        path: of the file; its ending says what kind it is.
+        stream: its content, where that is not what is on the disk.
+    """
     import trimesh  # slow to import, and many scenes have no mesh
 
     if not path.is_file():
@@ -106,13 +111,14 @@ def _read(path: Path):
             f"{path}: no reader for '{kind}' files{hint}; expected OBJ, STL, PLY or GLB"
         )
     try:
-        return trimesh.load(path, force="mesh", process=False)
+        source = path if stream is None else stream
+        return trimesh.load(source, file_type=kind, force="mesh", process=False)
     except Exception as error:  # the readers raise whatever their parser runs into
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MeshError(f"{path}: cannot be read as a mesh: {cause}") from error
 
 
-def _merged(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def merged(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices at one place made one (files repeat them at seams); no collapsed triangles."""
     size = float(np.ptp(vertices, axis=0).max())
     keys = np.round((vertices - vertices.min(axis=0)) / max(size * 1e-7, 1e-30)).astype(np.int64)
@@ -122,7 +128,7 @@ def _merged(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
     return vertices[first], triangles[(a != b) & (b != c) & (c != a)]
 
 
-def _open_edges(triangles: np.ndarray) -> tuple[np.ndarray, bool]:
+def open_edges(triangles: np.ndarray) -> tuple[np.ndarray, bool]:
     """Directed edges that no other triangle runs along the other way, (E, 2).
 
     Also whether some triangles are wound against their neighbours.
@@ -147,7 +153,7 @@ def _same_winding(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.asarray(mesh.faces, dtype=np.int64)
 
 
-def _components(cells: np.ndarray, vertex_count: int) -> np.ndarray:
+def components(cells: np.ndarray, vertex_count: int) -> np.ndarray:
     """Number of the connected part each vertex is in, from edges (E, 2) or triangles (T, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -157,9 +163,9 @@ def _components(cells: np.ndarray, vertex_count: int) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _close_holes(vertices, triangles, edges):
+def close_holes(vertices, triangles, edges):
     """Add a fan of triangles around the middle of each connected chain of open edges."""
-    label = _components(edges, len(vertices))
+    label = components(edges, len(vertices))
     _, hole = np.unique(label[edges[:, 0]], return_inverse=True)
     middles = np.stack(
         [
@@ -211,17 +217,17 @@ def load_surface(file: str, scale: float = 1.0) -> Surface:
 
 @lru_cache(maxsize=32)
 def _load_surface(path: Path, scale: float, stamp: int) -> Surface:
-    loaded = _read(path)
+    loaded = read_mesh(path)
     vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64).reshape(-1, 3)
     triangles = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
     _check_arrays(path, vertices, triangles)
-    vertices, triangles = _merged(vertices[np.unique(triangles)] * scale, _compact(triangles))
-    if not _areas(vertices[triangles]).sum() > 1e-12 * np.ptp(vertices, axis=0).max() ** 2:
+    vertices, triangles = merged(vertices[np.unique(triangles)] * scale, compact(triangles))
+    if not areas(vertices[triangles]).sum() > 1e-12 * np.ptp(vertices, axis=0).max() ** 2:
         raise MeshError(f"{path}: contains no triangles with an area")
-    edges, mixed = _open_edges(triangles)
+    edges, mixed = open_edges(triangles)
     if mixed:
         triangles = _same_winding(vertices, triangles)
-        edges, _ = _open_edges(triangles)
+        edges, _ = open_edges(triangles)
     share = ambiguous_share(vertices[triangles])
     if share > AMBIGUOUS_LIMIT:
         raise MeshError(
@@ -237,8 +243,8 @@ def _load_surface(path: Path, scale: float, stamp: int) -> Surface:
 def _closed(path: Path, vertices, triangles, edges) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with its holes closed, or MeshError if one of them is too large."""
     count = len(triangles)
-    closed_vertices, closed = _close_holes(vertices, triangles, edges)
-    area = _areas(closed_vertices[closed])
+    closed_vertices, closed = close_holes(vertices, triangles, edges)
+    area = areas(closed_vertices[closed])
     hole = closed[count:, 2] - len(vertices)
     holes = np.bincount(hole, weights=area[count:]) / area[:count].sum()
     if holes.max() > HOLE_LIMIT:
@@ -256,7 +262,7 @@ def _closed(path: Path, vertices, triangles, edges) -> tuple[np.ndarray, np.ndar
     return closed_vertices, closed
 
 
-def _areas(corners: np.ndarray) -> np.ndarray:
+def areas(corners: np.ndarray) -> np.ndarray:
     """Areas of triangles given by their corners (T, 3, 3)."""
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.linalg.norm(vectors, axis=1)
@@ -267,7 +273,7 @@ def _outward(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     A body is turned when only the front of its largest triangle is inside the mesh.
     """
-    body = _components(triangles, len(vertices))[triangles[:, 0]]
+    body = components(triangles, len(vertices))[triangles[:, 0]]
     corners = vertices[triangles]
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(vectors, axis=1)
@@ -283,7 +289,7 @@ def _outward(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.where((front & ~back)[body][:, None], triangles[:, ::-1], triangles)
 
 
-def _compact(triangles: np.ndarray) -> np.ndarray:
+def compact(triangles: np.ndarray) -> np.ndarray:
     """Triangles over their own vertices only, numbered in order."""
     return np.unique(triangles, return_inverse=True)[1].reshape(-1, 3)
 

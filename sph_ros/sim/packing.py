@@ -18,6 +18,7 @@ from sph_ros.sim.shape_types import (
     Cylinder,
     Difference,
     Mesh,
+    OpenSurface,
     Plane,
     Pose,
     Shape,
@@ -236,6 +237,10 @@ class _Packer:
 
     def add(self, shape: Shape) -> tuple[np.ndarray, float]:
         """Append the program of one solid; returns the ball around it, (centre, radius)."""
+        if isinstance(shape, OpenSurface):
+            if self.settings[2] == 2:
+                raise ValueError("surface: expected a solid shape in 2D, got an open mesh")
+            return np.zeros(3), 0.0  # an empty program is infinitely far from everything
         frame = _Frame(np.eye(3), np.zeros(3))
         tree = self.compiler.tree(shape, frame)
         if tree.depth > core.STACK_DEPTH:
@@ -322,7 +327,8 @@ def pack_shapes(
         centre, radius = packer.add(shape)
         bounds.append((*centre, min(radius, _UNBOUNDED)))
         starts.append(len(packer.nodes))
-    op, sign, transform, size, table, grid = zip(*packer.nodes, strict=True) if shapes else [()] * 6
+    nodes = packer.nodes
+    op, sign, transform, size, table, grid = zip(*nodes, strict=True) if nodes else [()] * 6
     return core.PackedShapes(
         support_radius=np.float32(support_radius),
         table_scale=np.float32(TABLE_STEPS / (2.0 * support_radius)),

@@ -30,6 +30,7 @@ from sph_ros.sim.shapes import (
     Cylinder,
     Difference,
     Mesh,
+    OpenSurface,
     Placed,
     Plane,
     Pose,
@@ -246,13 +247,18 @@ def _primitive(cls):
     return lambda node, folder: build(cls, node)
 
 
-def _read_mesh(node: Node, folder: Path) -> Mesh:
-    file = node.mapping().get("file")
-    if file is not None:
-        path = folder / file.text()
-        if not path.is_file():
-            raise file.error(f"no such mesh file: {path}")
-    return build(Mesh, node, {"file": lambda child: str(folder / child.text())})
+def _mesh_file(cls):
+    """Reader of a shape with a file, which is relative to the scene's folder."""
+
+    def read(node: Node, folder: Path):
+        file = node.mapping().get("file")
+        if file is not None:
+            path = folder / file.text()
+            if not path.is_file():
+                raise file.error(f"no such mesh file: {path}")
+        return build(cls, node, {"file": lambda child: str(folder / child.text())})
+
+    return read
 
 
 def _read_container(node: Node, folder: Path) -> Container:
@@ -292,7 +298,8 @@ SHAPE_KEYS = {
     "capsule": _primitive(Capsule),
     "cylinder": _primitive(Cylinder),
     "plane": _primitive(Plane),
-    "mesh": _read_mesh,
+    "mesh": _mesh_file(Mesh),
+    "surface": _mesh_file(OpenSurface),
     "union": _parts(Union),
     "difference": _parts(Difference),
     "container": _read_container,

@@ -17,6 +17,7 @@ from sph_ros.sim.shape_types import (
     Cylinder,
     Difference,
     Mesh,
+    OpenSurface,
     Placed,
     Plane,
     Pose,
@@ -24,6 +25,7 @@ from sph_ros.sim.shape_types import (
     Sphere,
     Union,
 )
+from sph_ros.sim.sheets import load_sheet
 
 #: Edge of the square that is drawn for a plane [m].
 PLANE_SIZE = 2.0
@@ -46,8 +48,8 @@ def bounding_radius(shape: Shape) -> float:
         return shape.radius + 0.5 * shape.length
     if isinstance(shape, Cylinder):
         return math.hypot(shape.radius, 0.5 * shape.length)
-    if isinstance(shape, Mesh):
-        vertices = load_surface(shape.file, shape.scale).vertices
+    if isinstance(shape, Mesh | OpenSurface):
+        vertices, _ = _triangles(shape)
         return float(np.linalg.norm(vertices, axis=1).max())
     if isinstance(shape, Union):
         return max(_placed_radius(part) for part in shape.of)
@@ -56,6 +58,14 @@ def bounding_radius(shape: Shape) -> float:
     if isinstance(shape, Container):
         return bounding_radius(shape.shape)
     return float(np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper))))
+
+
+def _triangles(shape: Mesh | OpenSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) [m] and triangles (T, 3) of a file."""
+    if isinstance(shape, OpenSurface):
+        return load_sheet(shape)
+    surface = load_surface(shape.file, shape.scale)
+    return surface.vertices, surface.triangles
 
 
 def _placed_radius(part: Placed) -> float:
@@ -74,8 +84,8 @@ def _extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         half = np.array([shape.radius, shape.radius, 0.5 * shape.length])
     elif isinstance(shape, Plane):
         half = np.full(3, math.inf)
-    elif isinstance(shape, Mesh):
-        vertices = load_surface(shape.file, shape.scale).vertices
+    elif isinstance(shape, Mesh | OpenSurface):
+        vertices, _ = _triangles(shape)
         return vertices.min(axis=0), vertices.max(axis=0)
     elif isinstance(shape, Container):
         return _extent(shape.shape)
@@ -103,7 +113,7 @@ def placed_extent(shape: Shape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
 
 
 def volume(shape: Shape) -> float:
-    """Volume of the material [m^3]; infinite for planes and containers.
+    """Volume of the material [m^3]; infinite for planes and containers, 0 for open surfaces.
 
     Exact for primitives; a mesh's bodies are added up; of unions and differences to about 1 %, from
     their sampled distance.
@@ -119,6 +129,8 @@ def volume(shape: Shape) -> float:
         return ends + math.pi * shape.radius**2 * shape.length
     if isinstance(shape, Plane | Container):
         return math.inf
+    if isinstance(shape, OpenSurface):
+        return 0.0
     lower, upper = _extent(shape)
     if not np.isfinite(upper - lower).all():
         return math.inf
@@ -174,9 +186,8 @@ def _surface(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         mesh.vertices -= 0.5 * (mesh.bounds[0] + mesh.bounds[1])
     elif isinstance(shape, Plane):
         return _square(shape)
-    elif isinstance(shape, Mesh):
-        surface = load_surface(shape.file, shape.scale)
-        return surface.vertices, surface.triangles
+    elif isinstance(shape, Mesh | OpenSurface):
+        return _triangles(shape)
     elif isinstance(shape, Container):
         return display_mesh(shape.shape)
     elif isinstance(shape, Union):

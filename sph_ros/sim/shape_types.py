@@ -145,6 +145,32 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class OpenSurface:
+    """Triangles that need not enclose anything: a wall with two sides and no inside, 3D only.
+
+    Attributes:
+        file: as for `Mesh`; broken faces are dropped.
+        scale: metres per unit of the file.
+        close_holes: holes with at most so many edges are closed, 0 for none.
+        restitution: speed after a particle met it over speed before, along the normal [-].
+        friction: speed that a particle loses along it, over speed that it loses or turns around
+            along the normal [-].
+    """
+
+    file: str
+    scale: float = quantity("m per unit of the file", 1.0, above=0.0)
+    close_holes: int = quantity("edges", 6, low=0, high=1e6)
+    restitution: float = quantity("1", 0.0, low=0.0, high=1.0)
+    friction: float = quantity("1", 0.0, low=0.0, high=10.0)
+
+    def __post_init__(self):
+        check_quantities(self)
+        if not str(self.file).strip():
+            raise ValueError(f"file: expected the path of a mesh, got {self.file!r}")
+        replace_fields(self, file=str(self.file), close_holes=int(self.close_holes))
+
+
+@dataclass(frozen=True)
 class Placed:
     """A shape somewhere in the frame of the shape it is part of."""
 
@@ -152,8 +178,8 @@ class Placed:
     pose: Pose = Pose()
 
     def __post_init__(self):
-        if not isinstance(self.shape, SHAPES):
-            raise ValueError(f"shape: expected a shape, got {self.shape!r}")
+        if not isinstance(self.shape, BODIES):
+            raise ValueError(f"shape: expected a shape with an inside, got {self.shape!r}")
         if not isinstance(self.pose, Pose):
             raise ValueError(f"pose: expected a Pose, got {self.pose!r}")
 
@@ -194,9 +220,13 @@ class Container:
     shape: "Shape"
 
     def __post_init__(self):
-        if not isinstance(self.shape, SHAPES):
-            raise ValueError(f"container: expected a shape, got {self.shape!r}")
+        if not isinstance(self.shape, BODIES):
+            raise ValueError(f"container: expected a shape with an inside, got {self.shape!r}")
 
 
-Shape = Sphere | Box | Capsule | Cylinder | Plane | Mesh | Union | Difference | Container
-SHAPES = (Sphere, Box, Capsule, Cylinder, Plane, Mesh, Union, Difference, Container)
+#: What has an inside.
+BODIES = (Sphere, Box, Capsule, Cylinder, Plane, Mesh, Union, Difference, Container)
+Body = Sphere | Box | Capsule | Cylinder | Plane | Mesh | Union | Difference | Container
+
+SHAPES = (*BODIES, OpenSurface)
+Shape = Body | OpenSurface

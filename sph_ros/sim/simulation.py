@@ -153,6 +153,7 @@ class Simulation:
             now = self.time + part * duration
             self._solids.advance(now, duration, fastest, self._liquid_reach())
             self._next_id = self._emitters.advance(self._fluid, self._solids, now, self._next_id)
+            self._reactions += self._solver.bounce(self._fluid, duration) / count
             self._reactions += self._solver.step(self._fluid, now, duration) / count
             self._sinks.advance(self._fluid, now + duration)
         self.timings = self._solver.timings

@@ -13,8 +13,10 @@ import numpy as np
 
 from sph_ros.core.contacts import Motion
 from sph_ros.core.distances import signed_distances
+from sph_ros.core.sheets import CORNER_CONTACTS, sheet_distances
 from sph_ros.sim import quaternions
 from sph_ros.sim.shapes import bounding_radius, display_mesh, pack_shapes
+from sph_ros.sim.sheets import pack_sheets
 
 
 class Waypoint(NamedTuple):
@@ -71,14 +73,14 @@ class Solid:
         velocity, angular_velocity: world frame [m/s], [rad/s], (3,), over the last substep.
     """
 
-    def __init__(self, spec, packed, index, dimension):
-        """Args: the scene's SolidSpec, packed shapes, index among them, 2 or 3."""
+    def __init__(self, spec, packed, sheets, index, dimension):
+        """Args: the scene's SolidSpec, packed shapes and sheets, index among them, 2 or 3."""
         self.name = spec.name
         self.control = spec.control
         self.shape = spec.shape
         self.color = spec.color
         self._spec = spec
-        self._packed = packed
+        self._packed, self._sheets = packed, sheets
         self._index = index
         self._dimension = dimension
         #: How far material reaches from the origin [m]; infinite for planes and containers.
@@ -131,6 +133,8 @@ class Solid:
     def signed_distance(self, points):
         """Distance of world points to the solid where it is now, negative inside the material.
 
+        An open surface has no inside.
+
         Args:
             points: [m], (M, 3).
 
@@ -139,10 +143,13 @@ class Solid:
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         local = (points - self.position) @ quaternions.to_matrix(self.quat_xyzw)
+        local = np.ascontiguousarray(local, dtype=np.float32)
         distance = np.empty(len(local), np.float32)
-        signed_distances(
-            self._packed, self._index, np.ascontiguousarray(local, dtype=np.float32), distance
-        )
+        sheet = self._sheets.sheet_of[self._index]
+        if sheet >= 0:
+            sheet_distances(self._sheets, sheet, local, distance)
+        else:
+            signed_distances(self._packed, self._index, local, distance)
         return distance
 
     def order(self, time, position, quat_xyzw):
@@ -232,6 +239,8 @@ class Solids:
 
     Attributes:
         packed: `PackedShapes`, for the kernels.
+        sheets: `Sheets`, those solids that are open surfaces.
+        slots: contacts that a particle can have at most.
         motion: `Motion`, poses at the start and the end of the present substep.
         travel: the farthest that a point of any solid moves in the present substep [m].
     """
@@ -245,8 +254,10 @@ class Solids:
             scene.spacing,
             scene.dimension,
         )
+        self.sheets = pack_sheets([spec.shape for spec in specs], scene.support_radius)
+        self.slots = len(specs) + (CORNER_CONTACTS - 1) * len(self.sheets.solid)
         self._solids = {
-            spec.name: Solid(spec, self.packed, index, scene.dimension)
+            spec.name: Solid(spec, self.packed, self.sheets, index, scene.dimension)
             for index, spec in enumerate(specs)
         }
         count = len(specs)

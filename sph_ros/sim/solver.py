@@ -8,6 +8,7 @@ import numpy as np
 
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
+from sph_ros.core import sheet_contacts as sheets
 from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.state import Workspace, make_grid
 
@@ -36,7 +37,7 @@ class Solver:
         if scene.dimension == 2:
             self._gravity[1] = 0.0
         self._h = np.float32(scene.support_radius)
-        self._work = Workspace(0, len(solids))
+        self._work = Workspace(0, len(solids), solids.slots)
         self._packing = 1.0
         self._listed = None
         self.iterations = 0
@@ -87,7 +88,7 @@ class Solver:
     def _prepare_rows(self, fluid):
         """Scratch memory that fits."""
         if self._work.capacity < fluid.capacity:
-            self._work = Workspace(fluid.capacity, len(self._solids))
+            self._work = Workspace(fluid.capacity, len(self._solids), self._solids.slots)
         if self._work.count != len(fluid):
             self._work.fit(len(fluid))
 
@@ -99,11 +100,63 @@ class Solver:
         self.timings[part] = self.timings.get(part, 0.0) + 1e3 * (now - self._passed)
         self._passed = now
 
+    def bounce(self, fluid, time_step):
+        """Impulses of open surfaces with restitution or friction on what meets them in a substep.
+
+        Args:
+            fluid: its velocities are changed.
+            time_step: of the substep [s].
+
+        Returns:
+            Force [N] and torque [N m] on each solid, (S, 6) float64.
+        """
+        solids = self._solids
+        reactions = np.zeros((max(search.chunk_count(len(fluid)), 1), len(solids), 6))
+        if solids.sheets.bounce.any():
+            sheets.bounce_off_sheets(
+                fluid.positions,
+                fluid.velocities,
+                fluid.clearance,
+                self._gravity,
+                np.float32(time_step),
+                np.float32(solids.travel),
+                solids.sheets,
+                solids.motion,
+                np.float32(MARGIN * self._scene.spacing),
+                np.float32(self.scales.mass),
+                reactions,
+            )
+        return reactions.sum(axis=0)
+
     def _keep_outside(self, starts, ends, origins, clearance, travel, motion, time_step):
-        work = self._work
-        scene = self._scene
-        if not len(self._solids):
+        """Stop particles on their way from `starts` to `ends` at the solids in `motion`."""
+        solids = self._solids
+        if not len(solids):
             return
+        paths = starts, ends, clearance, motion, time_step
+        self._keep_out_of_bodies(*paths, origins, travel)
+        if len(solids.sheets.solid):
+            self._stop_at_sheets(*paths)
+            if len(solids.sheets.solid) < len(solids):
+                # What a sheet held back may be in a body now. Sheets have the last word: a body
+                # gives back what is in it, a sheet does not.
+                self._keep_out_of_bodies(*paths, origins, travel)
+                self._stop_at_sheets(*paths)
+
+    def _stop_at_sheets(self, starts, ends, clearance, motion, time_step):
+        sheets.stop_at_sheets(
+            starts,
+            ends,
+            clearance,
+            self._solids.sheets,
+            motion,
+            np.float32(MARGIN * self._scene.spacing),
+            np.float32(self.scales.mass / time_step**2),
+            self._work.reactions,
+        )
+
+    def _keep_out_of_bodies(self, starts, ends, clearance, motion, time_step, origins, travel):
+        work, scene = self._work, self._scene
         work.squeezed[:] = 0
         touch.keep_outside(
             starts,
@@ -149,10 +202,12 @@ class Solver:
                 work.predicted,
                 clearance,
                 self._solids.packed,
+                self._solids.sheets,
                 self._solids.motion,
                 np.float32(1.0 / time_step),
                 np.float32(self._packing),
                 work.chunks,
+                work.slots,
                 work.contacts,
             )
 
@@ -161,3 +216,12 @@ class Solver:
         search.transpose(work.predicted, work.columns)
         while search.find_neighbors(work.columns, self._grid_now, self._h, work.chunks, work.pairs):
             work.enlarge_pairs()
+        if len(self._solids.sheets.solid):
+            sheets.part_pairs(
+                work.columns,
+                self._solids.sheets,
+                self._solids.motion,
+                work.contacts,
+                work.chunks,
+                work.pairs,
+            )

@@ -138,6 +138,7 @@ class Workspace:
 
     Attributes:
         count: N.
+        slots: most contacts of a particle.
         chunks: pieces of parallel work.
         predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
@@ -163,10 +164,17 @@ class Workspace:
         "targets": (0, np.float32),
     }
 
-    def __init__(self, capacity, solids, pairs_per_particle=44):
-        """Allocate for `capacity` particles, all of which are there, and `solids` solids."""
+    def __init__(self, capacity, solids, slots=None, pairs_per_particle=44):
+        """Allocate for `capacity` particles, all of which are there.
+
+        Args:
+            capacity: most particles.
+            solids: number of solids.
+            slots: most contacts of a particle; None: one with each solid.
+            pairs_per_particle: neighbours that there is room for at first.
+        """
         self.capacity = capacity
-        self.solids = solids
+        self.slots = solids if slots is None else slots
         chunks = max(chunk_count(capacity), 1)
         self._store = {
             name: np.zeros((capacity, columns) if columns else capacity, kind)
@@ -184,7 +192,7 @@ class Workspace:
             np.empty((capacity, 3), np.float32),
             np.empty(capacity, np.float32),
         )
-        room = chunks * CHUNK * solids
+        room = chunks * CHUNK * self.slots
         self._contacts = Contacts(
             np.zeros(capacity, np.int64),
             np.zeros(capacity, np.int64),
