@@ -231,7 +231,7 @@ def dropped(tmp_path, speed, **surface):
     sim = sph_ros.Simulation(
         {
             "spacing": 0.01,
-            "material": "air_like",
+            "material": {"base": "air_like", "density": 1000},
             "gravity": [0, 0, 0],
             "time_step": 0.001,
             "liquid": [{"box": {"size": [0.01] * 3}, "velocity": [speed[0], 0, speed[1]],
