@@ -50,12 +50,21 @@ def contact_velocities(positions, motion, inverse_step, contacts):
 
 
 @parallel_kernel
-def free_displacements(velocities, gravity, time_step, displacements):
-    """Add to displacements (N, 3) [m] what velocities [m/s] and gravity [m/s^2] make in a step."""
+def push(velocities, gravity, time_step, displacements):
+    """Velocities under all forces but pressure, and where they lead.
+
+    Args:
+        velocities: [m/s], (N, 3); changed.
+        gravity: [m/s^2], (3,) float32.
+        time_step: [s], float32.
+        displacements: those by other forces, from rest in one step [m], (N, 3); replaced by the
+            way that the changed velocities make.
+    """
+    inverse_step = np.float32(1.0) / time_step
     for i in prange(velocities.shape[0]):
         for axis in range(3):
-            velocity = velocities[i, axis] + time_step * gravity[axis]
-            displacements[i, axis] += time_step * velocity
+            velocities[i, axis] += time_step * gravity[axis] + displacements[i, axis] * inverse_step
+            displacements[i, axis] = time_step * velocities[i, axis]
 
 
 @parallel_kernel
@@ -122,15 +131,20 @@ def density_targets(
 
 
 @parallel_kernel
-def move(positions, displacements, longest, inverse_step, ends, velocities):
+def move(positions, free, displacements, longest, inverse_step, ends, velocities):
     """Positions and velocities after a step.
 
+    Velocities get only what the pressures changed: velocities from positions would lose digits, and
+    with them momentum.
+
     Args:
-        positions, displacements: [m], (N, 3).
+        positions: [m], (N, 3).
+        free: displacements without pressure [m], (N, 3).
+        displacements: with pressure [m], (N, 3).
         longest: displacements are cut at this length [m], float32.
         inverse_step: 1 / dt [1/s], float32.
         ends: [m], (N, 3); written.
-        velocities: [m/s], (N, 3); written.
+        velocities: those of `free` [m/s], (N, 3); changed.
     """
     for i in prange(positions.shape[0]):
         x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
@@ -141,15 +155,12 @@ def move(positions, displacements, longest, inverse_step, ends, velocities):
         for axis in range(3):
             step = scale * displacements[i, axis]
             ends[i, axis] = positions[i, axis] + step
-            velocities[i, axis] = step * inverse_step
+            velocities[i, axis] += (step - free[i, axis]) * inverse_step
 
 
 @parallel_kernel
 def take_stops(starts, origins, wanted, ends, inverse_step, velocities, fastest):
     """Take out of velocities what solids did not let happen.
-
-    Only the difference goes in: velocities from positions would lose the digits that conserve
-    momentum.
 
     Args:
         starts: where particles were [m], (N, 3).
@@ -166,8 +177,11 @@ def take_stops(starts, origins, wanted, ends, inverse_step, velocities, fastest)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             square = np.float32(0.0)
             for axis in range(3):
-                stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
-                velocities[i, axis] += stop * inverse_step
+                # Only where there was a stop: terms of this sum may be taken in another order, and
+                # their rounding would cost momentum.
+                if ends[i, axis] != wanted[i, axis] or origins[i, axis] != starts[i, axis]:
+                    stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
+                    velocities[i, axis] += stop * inverse_step
                 square += velocities[i, axis] * velocities[i, axis]
             most = max(most, square)
         fastest[chunk] = most

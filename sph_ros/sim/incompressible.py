@@ -112,7 +112,7 @@ class IncompressibleSolver(PressureSolver):
         tension = self._tension(unit)
         self._pull_together(tension)
         dt = np.float32(time_step)
-        project.free_displacements(fluid.velocities, self._gravity, dt, work.cohesive)
+        project.push(fluid.velocities, self._gravity, dt, work.cohesive)
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
         relax.pressure_displacements(
             work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.displacements
@@ -140,7 +140,13 @@ class IncompressibleSolver(PressureSolver):
         inverse_step = np.float32(1.0 / time_step)
         ends, wanted, origins = work.predicted, work.starts, work.scratch
         project.move(
-            fluid.positions, work.displacements, self._h, inverse_step, ends, fluid.velocities
+            fluid.positions,
+            work.cohesive,
+            work.displacements,
+            self._h,
+            inverse_step,
+            ends,
+            fluid.velocities,
         )
         wanted[:] = ends
         origins[:] = fluid.positions
