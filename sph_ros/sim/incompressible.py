@@ -21,7 +21,7 @@ CORRECTED = 0.4
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
-ERROR_SHARE, CALM = 0.25, 0.05
+ERROR_SHARE, CALM = 0.4, 0.05
 
 #: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
 #: Nothing else damps a symplectic step. Liquids that are thicker by themselves get none of it.
@@ -130,7 +130,8 @@ class IncompressibleSolver(PressureSolver):
             work.targets,
         )
         allowed = self._material.compression
-        self._iterate(work.targets, np.float32(0.0), Goal(CALM * allowed, ERROR_SHARE, allowed))
+        goal = Goal(CALM * allowed, ERROR_SHARE, allowed)
+        self._iterate(work.targets, np.float32(0.0), goal, displaced=True)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         self._react_to_pressures(tension, time_step)
 
@@ -161,7 +162,14 @@ class IncompressibleSolver(PressureSolver):
             time_step,
         )
         project.take_stops(
-            fluid.positions, origins, wanted, ends, inverse_step, fluid.velocities, work.errors
+            fluid.positions,
+            origins,
+            wanted,
+            ends,
+            inverse_step,
+            work.sums.density,
+            fluid.velocities,
+            work.errors,
         )
         self.fastest = float(np.sqrt(work.errors.max(initial=0.0)))
         fluid.positions[:] = ends

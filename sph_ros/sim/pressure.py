@@ -32,7 +32,7 @@ class Goal(NamedTuple):
     most: float = np.inf
 
 
-def solve_pressures(work, densities, gradients, compliance, goal, share):
+def solve_pressures(work, densities, gradients, compliance, goal, share, displaced=False):
     """Scaled pressures that hold the density, and the displacements they cause.
 
     Args:
@@ -43,6 +43,7 @@ def solve_pressures(work, densities, gradients, compliance, goal, share):
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.
         share: of the Jacobi correction to take.
+        displaced: whether `displacements` are already those of the first guess.
 
     Returns:
         Iterations taken, mean density error left, share to start from next time.
@@ -54,9 +55,10 @@ def solve_pressures(work, densities, gradients, compliance, goal, share):
         if restart:
             work.guesses[:] = work.scaled
             before, restart = np.inf, False
-        relax.pressure_displacements(
-            work.pairs, work.guesses, gradients, work.cohesive, work.displacements
-        )
+        if iteration > 1 or not displaced:
+            relax.pressure_displacements(
+                work.pairs, work.guesses, gradients, work.cohesive, work.displacements
+            )
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
         relax.correct_pressures(
             work.pairs,

@@ -110,13 +110,13 @@ class PressureSolver(Solver):
         else:
             work.cohesive[:] = 0.0
 
-    def _iterate(self, densities, compliance, goal):
+    def _iterate(self, densities, compliance, goal, displaced=False):
         """Pressures from the guess in `scaled`, and displacements; see `solve_pressures`."""
         work = self._work
         gradients = work.contacts.gradients
         relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
         self.iterations, self.density_error, self._share = solve_pressures(
-            work, densities, gradients, compliance, goal, self._share
+            work, densities, gradients, compliance, goal, self._share, displaced
         )
 
     def _react_to_pressures(self, tension, time_step):
