@@ -33,9 +33,9 @@ SCENE = {
 }
 
 
-@pytest.fixture
-def sim():
-    return sph_ros.Simulation(SCENE)
+@pytest.fixture(params=["relaxation", "incompressible"])
+def sim(request):
+    return sph_ros.Simulation({**SCENE, "solver": request.param})
 
 
 def test_arrays_have_the_promised_shapes_and_are_copies(sim):
@@ -150,7 +150,7 @@ def test_reset_starts_over_to_the_bit(sim):
 
 
 def test_asking_changes_nothing(sim):
-    twin = sph_ros.Simulation(SCENE)
+    twin = sph_ros.Simulation(sim.scene)
     for _ in range(5):
         assert sim.densities.max() > 0 and sim.statistics() and len(sim.surface())
         sim.step()

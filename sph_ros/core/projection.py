@@ -162,9 +162,7 @@ def move(positions, free, displacements, longest, inverse_step, ends, velocities
 
 
 @parallel_kernel
-def take_stops(
-    starts, origins, wanted, ends, inverse_step, density, velocities, fastest
-):
+def take_stops(starts, origins, wanted, ends, inverse_step, density, velocities, fastest):
     """Take out of velocities what solids did not let happen.
 
     Args:

@@ -179,7 +179,9 @@ def expected_speed(scene, drop):
         drop: height that the liquid can fall through [m].
     """
     g = math.sqrt(sum(c * c for c in scene.gravity))
-    initial = max((math.hypot(*block.velocity) for block in scene.liquid), default=0.0)
+    # Blocks may be sent at each other.
+    velocities = [(0.0, 0.0, 0.0), *(block.velocity for block in scene.liquid)]
+    initial = max(math.dist(a, b) for a in velocities for b in velocities)
     jets = [make_jet(emitter, scene).speed for emitter in scene.emitters]
     initial = max(initial, max(jets, default=0.0))
     return max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
