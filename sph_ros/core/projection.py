@@ -40,16 +40,17 @@ def contact_velocities(positions, motion, inverse_step, contacts):
         inverse_step: 1 / dt [1/s], float32.
         contacts: the surface velocities among `terms` are written.
     """
+    # A name of its own: numba loses writes to arrays of a tuple inside prange.
+    terms, solids = contacts.terms, contacts.solid
     for i in prange(positions.shape[0]):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         for k in range(contacts.start[i], contacts.end[i]):
-            s = contacts.solid[k]
-            t = contacts.terms[k]
+            s = solids[k]
             lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
             nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
-            t[SURFACE_VELOCITY] = (nx - x) * inverse_step
-            t[SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
-            t[SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+            terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
+            terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
+            terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
 
 
 @parallel_kernel

@@ -58,12 +58,15 @@ class IncompressibleSolver(PressureSolver):
             UnstableError: a position is not a number.
         """
         self._clock("start")
+        motion = self._solids.motion
         if self._listed is not fluid:
-            self._make_lists(fluid)
+            # The solids have already been moved on; the liquid is still beside their old poses.
+            before = motion._replace(position=motion.old_position, rotation=motion.old_rotation)
+            self._make_lists(fluid, before)
         work = self._work
         work.reactions[:] = 0.0
         project.contact_velocities(
-            work.predicted, self._solids.motion, np.float32(1.0 / time_step), work.contacts
+            work.predicted, motion, np.float32(1.0 / time_step), work.contacts
         )
         self._apply_viscosity(fluid, time_step)
         self._clock("viscosity")
@@ -83,12 +86,18 @@ class IncompressibleSolver(PressureSolver):
         if self._listed is not fluid:
             # Sort a copy: asking must not change the order of sums in later steps.
             twin = fluid.copy()
+            self._clock("start")
             self._make_lists(twin)
             return twin.public(self._work.sums.density)[fluid.particle]
         return self._work.sums.density.copy()
 
-    def _make_lists(self, fluid):
-        """Sort by cell; contacts, neighbours and densities at the present positions."""
+    def _make_lists(self, fluid, motion=None):
+        """Sort by cell; contacts, neighbours and densities at the present positions.
+
+        Args:
+            fluid: sorted in place.
+            motion: the solids are where it ends; the present one unless given.
+        """
         self._prepare_rows(fluid)
         work = self._work
         work.predicted[:] = fluid.positions
@@ -97,7 +106,7 @@ class IncompressibleSolver(PressureSolver):
         self._sort(fluid)
         search.gather_rows(work.order, velocities, fluid.velocities)
         self._clock("sort")
-        self._find_contacts(1.0, fluid.clearance)
+        self._find_contacts(1.0, fluid.clearance, motion)
         self._clock("solids")
         self._find_neighbors()
         self._clock("neighbors")

@@ -195,7 +195,8 @@ class Solver:
         work.predicted, work.scratch = work.scratch, work.predicted
         fluid.reorder(work.order)
 
-    def _find_contacts(self, time_step, clearance):
+    def _find_contacts(self, time_step, clearance, motion=None):
+        """Contacts with the solids at the end of `motion`, the present one unless given."""
         work = self._work
         if len(self._solids):
             touch.find_contacts(
@@ -203,7 +204,7 @@ class Solver:
                 clearance,
                 self._solids.packed,
                 self._solids.sheets,
-                self._solids.motion,
+                motion or self._solids.motion,
                 np.float32(1.0 / time_step),
                 np.float32(self._packing),
                 work.chunks,
