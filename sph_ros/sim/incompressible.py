@@ -23,6 +23,9 @@ CORRECTED = 0.4
 #: `CALM` and at most 1 times the material's `compression`.
 ERROR_SHARE, CALM = 0.4, 0.05
 
+#: Particles below this density are at a free surface; there is one if so many are [-].
+SURFACE_DENSITY, SURFACE_SHARE = 0.85, 0.01
+
 #: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
 #: Nothing else damps a symplectic step. Liquids that are thicker by themselves get none of it.
 LATTICE_VISCOSITY = 0.005
@@ -74,7 +77,11 @@ class IncompressibleSolver(PressureSolver):
         self._clock("pressure")
         self._move(fluid, time_step)
         self._clock("finish")
-        self._packing = packing(self._scene, time + time_step)
+        # Flowed liquid packs less well than the lattice. Where it has no room for that, because it
+        # fills a closed container, the rest density stays that of the lattice.
+        exposed = np.count_nonzero(work.sums.density < SURFACE_DENSITY)
+        if exposed > SURFACE_SHARE * len(fluid):
+            self._packing = packing(self._scene, time + time_step)
         if self._scene.emitters or self._scene.sinks:
             self._listed = None  # particles may come and go before the next step
         else:
