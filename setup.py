@@ -62,7 +62,8 @@ setup(
     ],
     extras_require={
         "ros": ROS_WHEELS,
-        "test": ["pytest", "ruff"],
+        # Playwright drives the installed Chromium in the tests of web_viewer: mouse, keys, pixels.
+        "test": ["pytest", "ruff", "playwright"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -1,98 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real browser without a screen: Chromium, spoken to in its DevTools protocol."""
+"""A real browser without a screen: the installed Chromium, driven by Playwright.
+
+with chromium() as browser:
+    page = Page(browser, "http://127.0.0.1:8080/")
+    page.button("pause").click()
+    image = page.picture()
+"""
 
 import base64
-import json
-import re
+import os
 import shutil
-import subprocess
-import tempfile
-import time
-from pathlib import Path
-from urllib.request import urlopen
+from contextlib import contextmanager
 
-from websockets.sync.client import connect
+import cv2
+import numpy as np
+import pytest
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+#: Playwright's own download of a browser is not used.
+PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
+
+# Pictures without a graphics card.
+OPTIONS = (
+    "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)  # fmt: skip
+
+SIZE = {"width": 1000, "height": 640}
+
+#: Pixels drawn along one of the page's layout: few, because the processor draws every one.
+RESOLUTION = 0.5
+
+#: Longest wait for anything on a page [ms].
+PATIENCE = 30_000
 
 
-class Browser:
-    """One page in a headless Chromium; a context manager.
+@contextmanager
+def chromium():
+    """A Playwright browser; skips the test where it or Chromium is missing."""
+    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    if program is None:
+        pytest.skip(f"no browser on this machine, expected one of {', '.join(PROGRAMS)}")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    quiet = {**os.environ, "DEBUG": ""}
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS), env=quiet)
+        try:
+            yield browser
+        finally:
+            browser.close()
 
-    Args:
-        url: to open.
-        size: of the page (width, height) [pixels].
+
+class Page:
+    """A page of the viewer in a window of its own.
+
+    Attributes:
+        errors: what the page's scripts complained of.
     """
 
-    def __init__(self, url, size=(1200, 850)):
-        self._url, self._size, self._number = url, size, 0
+    def __init__(self, browser, url):
+        self.context = browser.new_context(viewport=SIZE, device_scale_factor=RESOLUTION)
+        self.context.set_default_timeout(PATIENCE)
+        self.page = self.context.new_page()
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self._devtools = self.context.new_cdp_session(self.page)
+        self.page.goto(url)
 
-    def __enter__(self):
-        self._profile = tempfile.TemporaryDirectory(prefix="chromium_", ignore_cleanup_errors=True)
-        log_path = Path(self._profile.name) / "log.txt"
-        width, height = self._size
-        with open(log_path, "wb") as log:
-            self._process = subprocess.Popen(
-                [
-                    CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle",
-                    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-                    f"--window-size={width},{height}", "--remote-debugging-port=0",
-                    f"--user-data-dir={self._profile.name}", "about:blank",
-                ],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            )  # fmt: skip
-        port = self._wait_for_port(log_path)
-        with urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
-            page = next(page for page in json.load(answer) if page["type"] == "page")
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
-        self.send("Page.navigate", url=self._url)
-        return self
-
-    def __exit__(self, *_):
-        self._socket.close()
-        self._process.terminate()
-        self._process.wait(10.0)
-        self._profile.cleanup()
-
-    def _wait_for_port(self, log_path, timeout=30.0):
-        deadline = time.monotonic() + timeout
-        while time.monotonic() < deadline:
-            found = re.search(r"ws://127\.0\.0\.1:(\d+)/", log_path.read_text(errors="replace"))
-            if found:
-                return int(found[1])
-            time.sleep(0.05)
-        self._process.kill()
-        raise AssertionError(f"chromium did not start:\n{log_path.read_text(errors='replace')}")
-
-    def send(self, method, **parameters):
-        """One command of the protocol; returns its result."""
-        self._number += 1
-        message = {"id": self._number, "method": method, "params": parameters}
-        self._socket.send(json.dumps(message))
-        while True:
-            answer = json.loads(self._socket.recv(timeout=30.0))
-            if answer.get("id") == self._number:
-                assert "error" not in answer, answer
-                return answer["result"]
+    def close(self):
+        self.context.close()
 
     def text(self):
         """All text on the page."""
-        result = self.send("Runtime.evaluate", expression="document.body.innerText")
-        return result["result"].get("value", "")
+        return self.page.inner_text("body")
 
-    def click(self, label):
-        """Click the button with a label."""
-        expression = (
-            "[...document.querySelectorAll('button')]"
-            f".find(b => b.innerText.trim() === {json.dumps(label)}).click()"
-        )
-        self.send("Runtime.evaluate", expression=expression)
+    def wait_for(self, text):
+        """Until a text is seen."""
+        self.page.get_by_text(text).first.wait_for()
 
-    def mouse(self, kind, x, y):
-        """A mouse event: mousePressed, mouseMoved or mouseReleased at a place [pixels]."""
-        button = {"button": "left", "buttons": 0 if kind == "mouseReleased" else 1, "clickCount": 1}
-        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
+    def button(self, name):
+        return self.page.get_by_role("button", name=name, exact=True)
 
-    def screenshot(self, path):
-        """Save what the page shows as PNG."""
-        Path(path).write_bytes(base64.b64decode(self.send("Page.captureScreenshot")["data"]))
+    def tab(self, name):
+        self.page.get_by_role("tab", name=name, exact=True).click()
+
+    def field(self, label):
+        """The input beside a label."""
+        row = f"//label[normalize-space()='{label}']/ancestor::div[.//input][1]"
+        return self.page.locator(f"xpath={row}//input[not(@type='hidden')]").first
+
+    def slider(self, label):
+        """The handle of the slider under the field with a label."""
+        below = f"xpath=//label[normalize-space()='{label}']/following::div[contains(@class,"
+        return self.page.locator(f"{below}'multi-slider-thumb')]").first
+
+    def choose(self, label, option):
+        """Pick from a list."""
+        self.field(label).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def drag(self, points, pause=120):
+        """Press the mouse at the first of some points [pixels], move over the others, release."""
+        mouse = self.page.mouse
+        mouse.move(*points[0])
+        self.page.wait_for_timeout(pause)  # what is under the mouse is found with the next frame
+        mouse.down()
+        for point in points[1:]:
+            self.page.wait_for_timeout(pause)
+            mouse.move(*point)
+        self.page.wait_for_timeout(pause)
+        mouse.up()
+
+    def picture(self):
+        """What the page shows of the scene, (h, w, 3) int BGR; panels and notices are white."""
+        data = self._devtools.send("Page.captureScreenshot", {"optimizeForSpeed": True})["data"]
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        image = image.astype(int)
+        image[:, SIZE["width"] - 340 :] = 255
+        image[:150, :320] = 255
+        return image
+
+
+def blue(image):
+    """Where water and water-like particles are."""
+    b, _, r = image.transpose(2, 0, 1)
+    return (b > r + 50) & (b > 90)
+
+
+def orange(image):
+    """Where the ball is."""
+    b, _, r = image.transpose(2, 0, 1)
+    return (r > b + 80) & (r > 120)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches a fluid node: whether it is there, how it is and, if asked to, all it says."""
+"""Hears a fluid node: all it says into a bag, and whether it is there and how it is."""
 
 import time
 from functools import partial
@@ -26,8 +26,75 @@ DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
 DEPTH = 10
 
 
+class TopicRecorder:
+    """Hears the topics of a fluid node, counts the messages and writes them to a bag.
+
+    Args:
+        node: that subscribes.
+        fluid: full name of the fluid node.
+        failed: called with the exception when the bag cannot be written; None lets it out of the
+            callback. Nothing more is written then.
+
+    Attributes:
+        counts: messages heard, topic -> number.
+    """
+
+    def __init__(self, node, fluid="/fluid", failed=None):
+        self._node, self._fluid, self._failed = node, fluid, failed
+        self._bag, self._subscriptions = None, {}
+        self.counts = {}
+
+    def listen(self, solids):
+        """Subscribe to what the node says of its liquid and solids, and to the poses it gets.
+
+        Args:
+            solids: name of a solid -> whether it follows poses. May be called again with others.
+        """
+        self._subscribe(PointCloud2, POINT_CLOUD2, "particles")
+        self._subscribe(Marker, MARKER, "surface")
+        self._subscribe(MarkerArray, MARKER_ARRAY, "solids")
+        for name, controlled in solids.items():
+            self._subscribe(WrenchStamped, WRENCH_STAMPED, f"solids/{name}/wrench")
+            if controlled:
+                best_effort = ReliabilityPolicy.BEST_EFFORT
+                self._subscribe(PoseStamped, POSE_STAMPED, f"solids/{name}/pose", best_effort)
+
+    def record(self, bag):
+        """From now on write what is heard to an open BagWriter; counts begin at zero."""
+        self._bag = bag
+        self.counts = {}
+
+    def keep(self, topic, type_name, data):
+        """Count a message, and write it if a bag is open."""
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+        if self._bag is None:
+            return
+        try:
+            self._bag.write(topic, type_name, time.time_ns(), bytes(data))
+        except Exception as error:
+            self._bag = None
+            if self._failed is None:
+                raise
+            self._failed(error)
+
+    def close(self):
+        """Hear nothing more."""
+        self._bag = None
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.popitem()[1])
+
+    def _subscribe(self, message_class, type_name, name, policy=ReliabilityPolicy.RELIABLE):
+        topic = f"{self._fluid}/{name}"
+        if topic not in self._subscriptions:
+            qos = QoSProfile(depth=DEPTH, reliability=policy)
+            keep = partial(self.keep, topic, type_name)
+            self._subscriptions[topic] = self._node.create_subscription(
+                message_class, topic, keep, qos, raw=True
+            )
+
+
 class Recorder:
-    """Watches `/fluid` from this process; a context manager.
+    """Watches `/fluid` from this process with a node of its own; a context manager.
 
     Attributes:
         facts: newest diagnostics of the simulation, key -> text.
@@ -39,17 +106,22 @@ class Recorder:
         self._node = Node("demo")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self.facts, self.counts = {}, {}
+        self._topics = TopicRecorder(self._node)
+        self.facts = {}
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._keep_facts, DEPTH, raw=True
         )
-        self._bag = None
         return self
 
     def __exit__(self, *_):
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown()
+
+    @property
+    def counts(self):
+        """Messages heard, topic -> number."""
+        return self._topics.counts
 
     def spin(self, seconds):
         """Take what comes for some time [s]."""
@@ -62,32 +134,14 @@ class Recorder:
 
     def listen(self, scene):
         """Subscribe to the fluid's messages and the poses it gets, and count them."""
-        self._subscribe(PointCloud2, POINT_CLOUD2, "/fluid/particles")
-        self._subscribe(Marker, MARKER, "/fluid/surface")
-        self._subscribe(MarkerArray, MARKER_ARRAY, "/fluid/solids")
-        for solid in scene.solids:
-            self._subscribe(WrenchStamped, WRENCH_STAMPED, f"/fluid/solids/{solid.name}/wrench")
-            if solid.control == "topic":
-                topic = f"/fluid/solids/{solid.name}/pose"
-                self._subscribe(PoseStamped, POSE_STAMPED, topic, ReliabilityPolicy.BEST_EFFORT)
+        self._topics.listen({solid.name: solid.control == "topic" for solid in scene.solids})
 
     def record(self, bag):
         """From now on write what is heard to an open BagWriter; counts begin at zero."""
-        self._bag = bag
-        self.counts = {}
-
-    def _subscribe(self, message_class, type_name, topic, policy=ReliabilityPolicy.RELIABLE):
-        qos = QoSProfile(depth=DEPTH, reliability=policy)
-        keep = partial(self._keep, topic, type_name)
-        self._node.create_subscription(message_class, topic, keep, qos, raw=True)
-
-    def _keep(self, topic, type_name, data):
-        self.counts[topic] = self.counts.get(topic, 0) + 1
-        if self._bag is not None:
-            self._bag.write(topic, type_name, time.time_ns(), bytes(data))
+        self._topics.record(bag)
 
     def _keep_facts(self, data):
-        self._keep("/diagnostics", DIAGNOSTIC_ARRAY, data)
+        self._topics.keep("/diagnostics", DIAGNOSTIC_ARRAY, data)
         for status in deserialize_message(data, DiagnosticArray).status:
             if status.name == "fluid: simulation":
                 self.facts = {item.key: item.value for item in status.values}
