@@ -26,6 +26,9 @@ from sph_ros.core.contacts import (
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 
+#: Excess of density that may be taken back over several steps [-].
+MILD = np.float32(0.01)
+
 #: Density below which a particle counts as spray [-].
 SPRAY = 0.6
 
@@ -97,8 +100,9 @@ def density_targets(
         pairs: from `sum_densities` at `positions`.
         density: at `positions`, relative to rest [-], (N,).
         contacts: with the solids' velocities.
-        share: of an excess of density that is to be taken back in this step [-], float32. A lack of
-            density counts in full: so far a particle may be approached.
+        share: of an excess of density up to `MILD` that is to be taken back in this step [-],
+            float32; what is above goes at once. A lack of density counts in full: so far a particle
+            may be approached.
         time_step: [s], float32.
         targets: [-], (N,); written.
     """
@@ -126,7 +130,7 @@ def density_targets(
             grown += u * u - us[k] * us[k]
         excess = density[i] - one
         if excess > zero:
-            excess *= share
+            excess = share * min(excess, MILD) + max(excess - MILD, zero)
         for k in range(contacts.start[i], contacts.end[i]):
             t = contacts.terms[k]
             for axis in range(3):
