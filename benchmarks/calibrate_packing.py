@@ -1,25 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure `FLOWED_SHARE` of sph_ros.sim.scales: which rest density keeps the level of a column.
+"""Measure `FLOWED_SHARE` of the solvers' scales: which rest density keeps the level of a column.
 
 A column of lattice particles is shaken and comes to rest. With the lattice's own sum as rest
 density it sinks, because liquid that has flowed packs better. Two runs with different shares give
 the share for which the level stays.
 """
 
+import itertools
+
 import numpy as np
 
-from sph_ros.sim import scales
+from sph_ros.sim import force_scales, scales
 from sph_ros.sim.simulation import Simulation
 
 SPACING, LAYERS, WIDTH = 0.01, 18, 10
 
 
-def level(dimension, ratio, share):
+TABLES = {"relaxation": scales.FLOWED_SHARE, "forces": force_scales.FLOWED_SHARE}
+
+
+def level(solver, dimension, ratio, share):
     """Height of the topmost layer after shaking and rest, in spacings."""
-    scales.FLOWED_SHARE[dimension] = ((ratio, share),)
+    TABLES[solver][dimension] = ((ratio, share),)
     width, height = WIDTH * SPACING, LAYERS * SPACING
     simulation = Simulation(
         {
+            "solver": solver,
             "spacing": SPACING,
             "dimension": dimension,
             "support_radius": ratio * SPACING,
@@ -47,13 +53,17 @@ def level(dimension, ratio, share):
 
 def main():
     """Print the table."""
-    print(f"{'dimension':>9} {'h / spacing':>11} {'level, lattice':>14} {'share':>7}")
-    for dimension in (2, 3):
-        for ratio in (1.6, 2.0, 2.5, 3.0):
-            lattice, guess = level(dimension, ratio, 1.0), level(dimension, ratio, 0.95)
-            wanted = LAYERS - 0.5
-            share = 1.0 - 0.05 * (wanted - lattice) / (guess - lattice)
-            print(f"{dimension:>9} {ratio:>11.1f} {lattice:>14.2f} {share:>7.3f}", flush=True)
+    print(
+        f"{'solver':>10} {'dimension':>9} {'h / spacing':>11} {'level, lattice':>14} {'share':>7}"
+    )
+    for solver, dimension, ratio in itertools.product(TABLES, (2, 3), (1.6, 2.0, 2.5, 3.0)):
+        lattice = level(solver, dimension, ratio, 1.0)
+        guess = level(solver, dimension, ratio, 0.95)
+        wanted = LAYERS - 0.5
+        share = 1.0 - 0.05 * (wanted - lattice) / (guess - lattice)
+        print(
+            f"{solver:>10} {dimension:>9} {ratio:>11.1f} {lattice:>14.2f} {share:>7.3f}", flush=True
+        )
 
 
 if __name__ == "__main__":

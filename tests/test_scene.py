@@ -288,7 +288,7 @@ REFUSED_FILES = {
     "syntax": ("[0.15, 0.05, 0.1]", "[0.15, 0.05", ":10:33: not valid YAML", "expected"),
     "mesh": ("sphere: {radius: 0.03}", "mesh: {file: no.stl}", ":9: solids[1].mesh.file", "no.stl"),
     "control": ("sphere:", "control: topics\n    sphere:", ":9: solids[1].control", "topic"),
-    "planned": ("spacing:", "solver: forces\nspacing:", ":1: solver", "not available yet"),
+    "solver": ("spacing:", "solver: force\nspacing:", ":1: solver", "relaxation"),
     "material": ("spacing:", "material: watr\nspacing:", ":1: material", "'water'"),
     "material value": (
         "spacing:",

@@ -16,20 +16,23 @@ layer is pressed onto the wall; doubling the push instead (a wall particle with 
 particle it touches) has no potential and keeps a tank boiling. So walls push by the mirrored share;
 the covered one says how far a solid reaches sideways, at edges.
 
-For balls and cylinders the flat share is multiplied by the ratio of two continuous integrals of the
-weight, over the round solid and over the half space at the same distance.
+For balls and cylinders the flat share is multiplied by the ratio of two continuous integrals of
+Clavet's weights, over the round solid and over the half space at the same distance.
 
-Every table has the columns density and near-density and covers the distances -h ... h in equal
-steps; beyond h a wall adds nothing, deeper than -h its share is `full_cover`.
+Every table has the columns density and near-density (or what stands for them, see `POWERS`) and
+covers the distances -h ... h in equal steps; beyond h a wall adds nothing, deeper than -h its share
+is `full_cover`.
 """
 
 import math
 
 import numpy as np
 
-from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, lattice_sum
+from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, POLY6, lattice_sum, radial_weight
 
+#: The two weights that walls are tabulated for: Clavet's, and those of Mueller et al. 2003.
 POWERS = (DENSITY_POWER, NEAR_POWER)
+POLY6_AND_SPIKY = (POLY6, NEAR_POWER)
 
 #: Steps of a table from -h to h; linear interpolation is then wrong by less than 1e-4.
 TABLE_STEPS = 1024
@@ -44,14 +47,14 @@ def distances(support_radius):
     return np.linspace(-support_radius, support_radius, TABLE_STEPS + 1)
 
 
-def layer_weight(power, height, support_radius, spacing, dimension):
+def layer_weight(weight, height, support_radius, spacing, dimension):
     """What one infinite lattice layer adds at a height above it, mean over all places [-].
 
-    3D: (2 pi / s^2) integral of (1 - r/h)^p r dr from the height to h; 2D: (1/s) integral of the
-    weight along the line.
+    3D: (2 pi / s^2) integral of the weight times r dr from the height to h; 2D: (1/s) integral of
+    the weight along the line.
 
     Args:
-        power: p of the weight (1 - r/h)^p.
+        weight: p of the weight (1 - r/h)^p, or POLY6.
         height: distance from the layer [m], any shape.
         support_radius: h [m].
         spacing: s of the lattice [m].
@@ -60,17 +63,20 @@ def layer_weight(power, height, support_radius, spacing, dimension):
     q = np.minimum(np.abs(height) / support_radius, 1.0)
     if dimension == 3:
         rest = 1.0 - q
-        radial = rest ** (power + 1) / (power + 1) - rest ** (power + 2) / (power + 2)
+        if weight == POLY6:
+            radial = (1.0 - q * q) ** 4 / 8.0
+        else:
+            radial = rest ** (weight + 1) / (weight + 1) - rest ** (weight + 2) / (weight + 2)
         return 2.0 * math.pi * (support_radius / spacing) ** 2 * radial
     nodes, node_weights = np.polynomial.legendre.leggauss(48)
     half_chord = np.sqrt(1.0 - q * q)[..., None]
     along = 0.5 * half_chord * (nodes + 1.0)
     r = np.sqrt(q[..., None] ** 2 + along**2)
-    integral = (0.5 * half_chord * node_weights * (1.0 - r) ** power).sum(axis=-1)
+    integral = (0.5 * half_chord * node_weights * radial_weight(weight, r)).sum(axis=-1)
     return 2.0 * support_radius / spacing * integral
 
 
-def flat_wall(distance, support_radius, spacing, dimension, mirrored):
+def flat_wall(distance, support_radius, spacing, dimension, mirrored, weights=POWERS):
     """Share of the rest density that a flat wall adds at a signed distance [-], (..., 2).
 
     It never grows with the distance: where the sum of layers ripples deep inside the wall, its
@@ -82,6 +88,7 @@ def flat_wall(distance, support_radius, spacing, dimension, mirrored):
         spacing: s of the lattice [m].
         dimension: 2 or 3.
         mirrored: which of the two readings (see above).
+        weights: of the two columns.
     """
     distance = np.asarray(distance, dtype=float)
     fine = np.linspace(-support_radius, support_radius, 8 * TABLE_STEPS + 1)
@@ -89,14 +96,38 @@ def flat_wall(distance, support_radius, spacing, dimension, mirrored):
     covered = fine[:, None] + (layers + 0.5) * spacing
     height = 2.0 * fine[:, None] + layers * spacing if mirrored else covered
     columns = []
-    for power in POWERS:
-        full = lattice_sum(power, support_radius, spacing, dimension)
-        terms = layer_weight(power, height, support_radius, spacing, dimension)
+    for weight in weights:
+        full = lattice_sum(weight, support_radius, spacing, dimension)
+        terms = layer_weight(weight, height, support_radius, spacing, dimension)
         share = np.maximum.accumulate(terms.sum(axis=1)[::-1])[::-1] / full
-        deepest = layer_weight(power, covered[0], support_radius, spacing, dimension).sum() / full
+        deepest = layer_weight(weight, covered[0], support_radius, spacing, dimension).sum() / full
         share = np.minimum(share, deepest)
         columns.append(np.interp(distance, fine, share, right=0.0))
     return np.stack(columns, axis=-1)
+
+
+def flat_wall_laplacian(share, support_radius, spacing, dimension):
+    """Laplacian of the poly6 colour of a flat wall where its share is as given [1/m^2].
+
+    The wall stays where it is (its layers at the mirrored places), so this is the second derivative
+    of the layers' weights, by differences.
+
+    Args:
+        share: of the rest density that the wall adds [-], any shape.
+        support_radius: h [m].
+        spacing: s of the lattice [m].
+        dimension: 2 or 3.
+    """
+    settings = (support_radius, spacing, dimension)
+    away = np.linspace(support_radius, 0.0, 513)
+    shares = flat_wall(away, *settings, mirrored=True, weights=POLY6_AND_SPIKY)[:, 0]
+    heights = 2.0 * away[:, None] + np.arange(int(2.0 * support_radius / spacing) + 1) * spacing
+    step = 1e-3 * support_radius
+    above, here, below = (
+        layer_weight(POLY6, heights + shift, *settings).sum(axis=1) for shift in (step, 0.0, -step)
+    )
+    laplacian = (above - 2.0 * here + below) / step**2 / lattice_sum(POLY6, *settings)
+    return np.interp(share, shares, laplacian)
 
 
 def _shells(support_radius):
@@ -166,7 +197,8 @@ class WallTables:
         full_cover: share of the rest density deep inside a wall, density and near-density, (2,).
     """
 
-    def __init__(self, support_radius, spacing, dimension):
+    def __init__(self, support_radius, spacing, dimension, weights=POWERS):
+        self.weights = weights
         self.support_radius = support_radius
         self.spacing = spacing
         self.dimension = dimension
@@ -180,7 +212,8 @@ class WallTables:
 
     def flat(self, distance, mirrored=True):
         """Share that a flat wall adds at the distances [m], (..., 2)."""
-        return flat_wall(distance, self.support_radius, self.spacing, self.dimension, mirrored)
+        settings = (self.support_radius, self.spacing, self.dimension)
+        return flat_wall(distance, *settings, mirrored, self.weights)
 
     def ball(self, radius, inverted):
         """Index of the table of a ball (2D: a disc) of this radius [m]."""

@@ -5,13 +5,31 @@ Clavet, Beaudoin & Poulin 2005 weigh a neighbour at distance r by (1 - r/h)^2 fo
 (1 - r/h)^3 for the near-density. Their sums have no unit. Here both are divided by their sum over
 the liquid at rest, a square lattice of the particle spacing, self included: a density of 1 is the
 rest density.
+
+Mueller, Charypar & Gross 2003 have other weights. Of two of them walls need sums: poly6,
+(1 - r^2/h^2)^3, is `POLY6` here, and the shape of spiky, (1 - r/h)^3, is the power 3.
 """
 
 import itertools
 import math
 
+import numpy as np
+
 DENSITY_POWER = 2
 NEAR_POWER = 3
+POLY6 = "poly6"
+
+
+def radial_weight(weight, q):
+    """Shape of a weight at q = r/h in 0 ... 1, any shape; 1 at q = 0 [-].
+
+    Args:
+        weight: the power p of (1 - q)^p, or POLY6.
+        q: distance over support radius [-].
+    """
+    if weight == POLY6:
+        return (1.0 - np.square(q)) ** 3
+    return (1.0 - np.asarray(q)) ** weight
 
 
 def _lattice_distances(support_radius, spacing, dimension):
@@ -23,17 +41,17 @@ def _lattice_distances(support_radius, spacing, dimension):
             yield distance
 
 
-def lattice_sum(power, support_radius, spacing, dimension):
-    """Sum of (1 - r/h)^power over the rest lattice, self included [-].
+def lattice_sum(weight, support_radius, spacing, dimension):
+    """Sum of a weight over the rest lattice, self included [-].
 
     Args:
-        power: 2 for the density, 3 for the near-density.
+        weight: 2 for the density, 3 for the near-density, or POLY6.
         support_radius: h [m].
         spacing: of the square (2D) or cubic (3D) lattice [m].
         dimension: 2 or 3.
     """
     return math.fsum(
-        (1.0 - r / support_radius) ** power
+        float(radial_weight(weight, r / support_radius))
         for r in _lattice_distances(support_radius, spacing, dimension)
     )
 

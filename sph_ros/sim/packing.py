@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sph_ros.core import distances as core
-from sph_ros.core.wall_tables import TABLE_STEPS, WallTables
+from sph_ros.core.wall_tables import POWERS, TABLE_STEPS, WallTables
 from sph_ros.sim.meshes import DistanceGrid, load_distance_grid
 from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shape_types import (
@@ -228,10 +228,10 @@ def _bound(tree, grid_bounds: dict) -> tuple[np.ndarray, float]:
 class _Packer:
     """Collects nodes, tables and grids of all solids."""
 
-    def __init__(self, support_radius: float, spacing: float, dimension: int):
+    def __init__(self, support_radius: float, spacing: float, dimension: int, weights: tuple):
         self.compiler = _Compiler(dimension)
         self.settings = (support_radius, spacing, dimension)
-        self.tables = WallTables(support_radius, spacing, dimension)
+        self.tables = WallTables(support_radius, spacing, dimension, weights)
         self.nodes: list[tuple] = []
         self.grids: dict[tuple[Mesh, bool], tuple[int, DistanceGrid]] = {}
 
@@ -301,7 +301,11 @@ def _stacked(rows: Sequence, dtype, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def pack_shapes(
-    shapes: Sequence[Shape], support_radius: float, spacing: float, dimension: int
+    shapes: Sequence[Shape],
+    support_radius: float,
+    spacing: float,
+    dimension: int,
+    weights: tuple = POWERS,
 ) -> core.PackedShapes:
     """Pack solids for the compiled functions; solid i is shapes[i], in its own frame.
 
@@ -310,6 +314,7 @@ def pack_shapes(
         support_radius: h [m].
         spacing: of the particles [m].
         dimension: 3, or 2 for a liquid in the x-z plane: extents along y then count as endless.
+        weights: the two that the wall tables are made for (`core.wall_tables`).
 
     Raises:
         ValueError: a shape has no meaning in 2D or is nested too deep.
@@ -321,7 +326,7 @@ def pack_shapes(
         raise ValueError(
             f"support_radius: expected more than the spacing {spacing!r}, got {support_radius!r}"
         )
-    packer = _Packer(float(support_radius), float(spacing), dimension)
+    packer = _Packer(float(support_radius), float(spacing), dimension, weights)
     starts, bounds = [0], []
     for shape in shapes:
         centre, radius = packer.add(shape)

@@ -208,10 +208,10 @@ def stable_time_step(scene, scales, drop, courant):
         bounds["surface tension"] = 0.38 * h / soft
     reason = min(bounds, key=bounds.get)
     step = min(bounds[reason], 0.01)
-    return (_round_down(step), reason if step == bounds[reason] else "10 ms at most")
+    return (readable_step(step), reason if step == bounds[reason] else "10 ms at most")
 
 
-def _round_down(step):
+def readable_step(step):
     """The largest readable number not above `step`: 1, 1.25, ... 8 times a power of ten."""
     exponent = math.floor(math.log10(step))
     for mantissa in (8, 6.4, 5, 4, 3.2, 2.5, 2, 1.6, 1.25, 1):

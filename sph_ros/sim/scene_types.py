@@ -19,9 +19,8 @@ from sph_ros.sim.quantities import (
 )
 from sph_ros.sim.shapes import Box, Capsule, Cylinder, Plane, Pose, Shape, Sphere
 
-#: Solvers that exist, and those that are announced but cannot be chosen yet.
-SOLVERS = ("relaxation", "incompressible")
-PLANNED_SOLVERS = ("forces",)
+#: Names of the solvers (`sim.solvers` says what they are).
+SOLVERS = ("relaxation", "forces", "incompressible")
 
 #: Who moves a solid.
 CONTROLS = ("fixed", "topic", "path")
@@ -261,8 +260,6 @@ class Scene:
         self._check_names()
 
     def _check_words(self):
-        if self.solver in PLANNED_SOLVERS:
-            raise ValueError(f"solver: {self.solver!r} is not available yet; {SOLVERS} are")
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
         if type(self.dimension) is not int or self.dimension not in (2, 3):

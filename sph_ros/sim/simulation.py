@@ -56,7 +56,7 @@ class Simulation:
         ensure_compiled()
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.material = self.scene.material
-        self._solids = Solids(self.scene)
+        self._solids = Solids(self.scene, SOLVER_CLASSES[self.scene.solver].WEIGHTS)
         self._start()
 
     def _start(self):

@@ -14,6 +14,7 @@ import numpy as np
 from sph_ros.core.contacts import Motion
 from sph_ros.core.distances import signed_distances
 from sph_ros.core.sheets import CORNER_CONTACTS, sheet_distances
+from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim import quaternions
 from sph_ros.sim.shapes import bounding_radius, display_mesh, pack_shapes
 from sph_ros.sim.sheets import pack_sheets
@@ -245,14 +246,20 @@ class Solids:
         travel: the farthest that a point of any solid moves in the present substep [m].
     """
 
-    def __init__(self, scene):
-        """Pack the shapes of `scene` and put the solids at their first poses."""
+    def __init__(self, scene, weights=POWERS):
+        """Pack the shapes of `scene` and put the solids at their first poses.
+
+        Args:
+            scene: the scene.
+            weights: of the solver, which walls act with (`core.wall_tables`).
+        """
         specs = scene.solids
         self.packed = pack_shapes(
             [spec.shape for spec in specs],
             scene.support_radius,
             scene.spacing,
             scene.dimension,
+            weights,
         )
         self.sheets = pack_sheets([spec.shape for spec in specs], scene.support_radius)
         self.slots = len(specs) + (CORNER_CONTACTS - 1) * len(self.sheets.solid)

@@ -9,6 +9,7 @@ import numpy as np
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import sheet_contacts as sheets
+from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.state import Workspace, make_grid
 
@@ -27,6 +28,9 @@ class Solver:
         squeezed: particles rescued from between solids since somebody set it to 0.
         timings: milliseconds of the last step by part.
     """
+
+    #: Weights that walls act with.
+    WEIGHTS = POWERS
 
     def __init__(self, scene, solids, depth):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""

@@ -144,7 +144,8 @@ class Workspace:
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses, targets: of the pressure iterations, (N,) float32.
-        errors: (chunks,) float64; squeezed: (chunks,) int64.
+        errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
+        totals: (chunks, 3) float64.
         reactions: wrench per chunk and solid, (chunks, S, 6) float64.
         pairs, sums, contacts: see their classes.
     """
@@ -182,6 +183,8 @@ class Workspace:
         }
         self._chunk_store = {
             "errors": np.zeros(chunks, np.float64),
+            "strongest": np.zeros(chunks, np.float64),
+            "totals": np.zeros((chunks, 3), np.float64),
             "squeezed": np.zeros(chunks, np.int64),
             "reactions": np.zeros((chunks, solids, 6), np.float64),
         }
