@@ -317,10 +317,11 @@ class Bodies:
         turning = np.empty((len(self), 3))
         halfway = self.quat_xyzw.copy()
         for b, start in enumerate(self.quat_xyzw):
-            for _ in range(MIDPOINT_ROUNDS):
+            for done in range(MIDPOINT_ROUNDS + 1):
                 inverse = self._turned(halfway[b], self._local_inverse[b])
                 turning[b] = inverse @ self.spin[b]
-                halfway[b] = quaternions.turned(start, 0.5 * duration * turning[b])
+                if done < MIDPOINT_ROUNDS:
+                    halfway[b] = quaternions.turned(start, 0.5 * duration * turning[b])
         return turning, halfway
 
     def _turned(self, quat_xyzw, tensor):

@@ -27,7 +27,7 @@ from sph_ros.sim.shape_types import (
 )
 
 # Samples along the longest side of a shape whose moments are taken from its distance.
-_SAMPLES = {3: 96, 2: 768}
+_SAMPLES = {3: 64, 2: 512}
 
 
 @dataclass(frozen=True)
