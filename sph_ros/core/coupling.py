@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sph_ros.core.contacts import FRACTION, GRADIENT, NORMAL, SURFACE_VELOCITY
+from sph_ros.core.contact_data import FRACTION, GRADIENT, NORMAL, SURFACE_VELOCITY
 from sph_ros.core.impulses import settle_touches
 from sph_ros.core.jit import kernel
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sph_ros.core.contacts import normal_called, rotate, to_solid, to_world
+from sph_ros.core.contact_data import rotate, to_solid, to_world
+from sph_ros.core.contacts import normal_called
 from sph_ros.core.jit import device, kernel
 
 #: Touches of one pair of solids at most, and candidates they are chosen from.
@@ -32,7 +33,8 @@ class Samples(NamedTuple):
     Attributes:
         start: samples of solid s are start[s]:start[s + 1], (S + 1,) int64.
         point: in the solid's frame [m], (P, 3) float32.
-        normal: out of the solid there; 0 for round samples, (P, 3) float32.
+        normal: out of the solid there; 0 for round samples and those of sheets, which have two
+            sides, (P, 3) float32.
         radius: of the ball about the point that belongs to the solid [m], (P,) float32.
         probe: unit vectors all around, (Q, 3) float32; in 2D all around in the plane.
     """
@@ -134,7 +136,8 @@ def candidates_of_pair(shapes, samples, places, own, other, reach, found):
         wx, wy, wz = rotate(places.rotation, other, nx, ny, nz)
         out = samples.normal[p]
         ox, oy, oz = rotate(places.rotation, own, out[0], out[1], out[2])
-        if ox * wx + oy * wy + oz * wz < _OPPOSED:
+        two_sided = out[0] == 0.0 and out[1] == 0.0 and out[2] == 0.0
+        if two_sided or ox * wx + oy * wy + oz * wz < _OPPOSED:
             count = keep_candidate(found, count, p, x, y, z, wx, wy, wz, distance)
     return count
 

@@ -154,7 +154,7 @@ class Bodies:
             moving, turning = self.velocities[b, :3], self.velocities[b, 3:]
             self._solids[index].place(
                 self.centre[b] + arm,
-                self.quat_xyzw[b],
+                self.quat_xyzw[b].copy(),
                 moving + np.cross(turning, arm),
                 turning.copy(),
             )

@@ -17,7 +17,17 @@ from sph_ros.sim.quantities import (
     replace_fields,
     unit_vector,
 )
-from sph_ros.sim.shapes import Box, Capsule, Container, Cylinder, Plane, Pose, Shape, Sphere
+from sph_ros.sim.shapes import (
+    Box,
+    Capsule,
+    Container,
+    Cylinder,
+    OpenSurface,
+    Plane,
+    Pose,
+    Shape,
+    Sphere,
+)
 
 #: Solvers that exist, and those that are announced but cannot be chosen yet.
 SOLVERS = ("relaxation", "incompressible")
@@ -209,9 +219,9 @@ class SolidSpec:
                     "density: expected a density [kg/m^3] or a mass [kg], because control is free; "
                     "got neither"
                 )
-            if isinstance(self.shape, Plane | Container):
-                kind = type(self.shape).__name__.lower()
-                raise ValueError(f"control: a {kind} has no end, so it cannot be free")
+            if isinstance(self.shape, Plane | Container | OpenSurface):
+                kind = type(self.shape).__name__
+                raise ValueError(f"control: a {kind} has no definite volume, so it cannot be free")
             return
         for field in ("velocity", "angular_velocity"):
             if any(getattr(self, field)):

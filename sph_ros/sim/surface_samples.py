@@ -9,7 +9,17 @@ from sph_ros.core.distances import signed_distances
 from sph_ros.core.touching import Samples
 from sph_ros.sim.packing import pack_shapes
 from sph_ros.sim.shape_geometry import display_mesh, extent
-from sph_ros.sim.shape_types import Box, Capsule, Container, Cylinder, Plane, Shape, Sphere
+from sph_ros.sim.shape_types import (
+    Box,
+    Capsule,
+    Container,
+    Cylinder,
+    OpenSurface,
+    Plane,
+    Shape,
+    Sphere,
+    Union,
+)
 
 #: Samples lie no farther apart than this share of the solid's size, nor closer than a spacing.
 _PARTS = 12
@@ -59,6 +69,9 @@ def _samples(shape: Shape, spacing: float, dimension: int):
         return points, points, np.zeros(0)
     if isinstance(shape, Sphere | Capsule):
         return _round_points(shape)
+    if isinstance(shape, OpenSurface):  # a body must not slip through between samples
+        points, normals = _mesh_points(shape, spacing)
+        return points, 0.0 * normals, np.zeros(len(points))
     step = max(spacing, float((upper - lower).max()) / _PARTS)
     if isinstance(shape, Box) or (isinstance(shape, Cylinder) and dimension == 2):
         points, normals = _box_points(lower, upper, step, dimension)
@@ -112,9 +125,9 @@ def _mesh_points(shape, step):
         points.append(rows.reshape(-1, 3))
         outward.append(np.repeat(normals[parts == count], len(weights), axis=0))
     points, outward = np.concatenate(points), np.concatenate(outward)
-    # The parts of a union overlap: what is inside another part touches nothing.
-    bare = _distances(shape, points, step, 3) > -0.25 * step
-    points, outward = points[bare], outward[bare]
+    if isinstance(shape, Union):  # what is inside another part touches nothing
+        bare = _distances(shape, points, step, 3) > -0.25 * step
+        points, outward = points[bare], outward[bare]
     chosen = _thinned(points, outward, 0.5 * step)
     return points[chosen], outward[chosen]
 
