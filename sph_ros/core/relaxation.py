@@ -152,6 +152,7 @@ def correct_pressures(
     densities,
     contact_gradients,
     displacements,
+    yielded,
     diagonal,
     compliance,
     share,
@@ -170,6 +171,7 @@ def correct_pressures(
         densities: at the displacements zero, relative to rest [-], (N,).
         contact_gradients: as in `cohesive_displacements`.
         displacements: by the present guesses [m], (N, 3).
+        yielded: how much the density sinks because free bodies give way to the guesses [-], (N,).
         diagonal: from `pressure_diagonal`.
         compliance: as in `pressure_diagonal`.
         share: of the Jacobi correction that is taken [-], float32.
@@ -187,6 +189,7 @@ def correct_pressures(
                 contact_gradients[i, 0] * x
                 + contact_gradients[i, 1] * y
                 + contact_gradients[i, 2] * z
+                - yielded[i]
             )
             start, end = pairs.start[i], pairs.end[i]
             js = pairs.neighbors[start:end]

@@ -79,7 +79,12 @@ def pose_status(name, gate, refused_before):
         "poses_refused": refused,
         **{f"refused_{reason}": gate.refused[reason] for reason in REASONS},
     }
-    return _status(level, f"{name}: solid {gate.solid}", message, gate.solid, facts)
+    return solid_status(level, name, gate.solid, message, facts)
+
+
+def solid_status(level, name, solid, message, facts):
+    """A DiagnosticStatus of one solid of the node `name`."""
+    return _status(level, f"{name}: solid {solid}", message, solid, facts)
 
 
 def diagnostic_array(stamp_ns, frame, statuses):

@@ -38,6 +38,7 @@ from sph_ros.nodes.runner import Runner
 from sph_ros.nodes.running import run_node
 from sph_ros.nodes.schedules import ClockSchedule, WallSchedule
 from sph_ros.nodes.surface_worker import SurfaceWorker
+from sph_ros.nodes.unheard import UnheardPoses
 from sph_ros.sim.scene import SceneError, load_scene
 from sph_ros.sim.simulation import Simulation
 from sph_ros.waiting import tell_while_waiting, warm_up
@@ -176,6 +177,7 @@ class FluidNode(Node):
     def _create_diagnostics(self):
         self._speedometer = Speedometer(self._runner)
         self._refused_before = {}
+        self._unheard = UnheardPoses(self)
         self._skipped_before = 0.0
         self._report = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -329,6 +331,7 @@ class FluidNode(Node):
         """Have the driver gather the facts between two steps, and publish them."""
         factor, step_time = self._speedometer.read()
         self._warn_if_slow(factor)
+        self._unheard.look(self._runner.sim.scene.solids)
         if self._diagnostics.get_subscription_count() == 0:
             return
         if self._report is not None and not self._report.done():
@@ -343,6 +346,7 @@ class FluidNode(Node):
             before = self._refused_before.get(gate.solid, 0)
             statuses.append(pose_status(name, gate, before))
             self._refused_before[gate.solid] = sum(gate.refused.values())
+        statuses += self._unheard.statuses()
         array = diagnostic_array(self._driver.stamp_ns(), scene.frame, statuses)
         self._diagnostics.publish(array)
 

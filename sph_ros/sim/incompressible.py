@@ -71,6 +71,7 @@ class IncompressibleSolver(PressureSolver):
         project.contact_velocities(
             work.predicted, motion, np.float32(1.0 / time_step), work.contacts
         )
+        self._couple(self._solids.bodies.inertias.centre, time_step)
         self._apply_viscosity(fluid, time_step)
         self._clock("viscosity")
         self._project(fluid, time_step)
@@ -126,7 +127,10 @@ class IncompressibleSolver(PressureSolver):
         work = self._work
         unit = self._pressure_unit(time_step)
         tension = self._tension(unit)
-        self._pull_together(tension)
+        if self._coupling is not None:
+            self._coupling.predict()
+        self._pull_together(tension, time_step)
+        self._push_bodies(self._solids.bodies.inertias.centre)
         dt = np.float32(time_step)
         project.push(fluid.velocities, self._gravity, dt, work.cohesive)
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
@@ -147,9 +151,9 @@ class IncompressibleSolver(PressureSolver):
         )
         allowed = self._material.compression
         goal = Goal(CALM * allowed, ERROR_SHARE, allowed)
-        self._iterate(work.targets, np.float32(0.0), goal, displaced=True)
+        self._iterate(work.targets, np.float32(0.0), goal, time_step, displaced=True)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
-        self._react_to_pressures(tension, time_step)
+        self._push_bodies(self._solids.bodies.inertias.centre)
 
     def _move(self, fluid, time_step):
         """New positions, outside all solids, and velocities."""
@@ -168,6 +172,7 @@ class IncompressibleSolver(PressureSolver):
         wanted[:] = ends
         origins[:] = fluid.positions
         solids = self._solids
+        solids.finish()
         self._keep_outside(
             fluid.positions,
             ends,
@@ -177,6 +182,7 @@ class IncompressibleSolver(PressureSolver):
             solids.motion,
             time_step,
         )
+        self._push_bodies()
         project.take_stops(
             fluid.positions,
             origins,

@@ -35,6 +35,13 @@ _SCENE = {
             "pose": {"position": [0.05, 0.05, 0.2]},
             "control": "topic",
         },
+        {
+            "name": "cube",
+            "box": {"size": [0.03, 0.03, 0.03]},
+            "pose": {"position": [0.05, 0.05, 0.12]},
+            "control": "free",
+            "density": 500.0,
+        },
     ],
     "emitters": [
         {"position": [0.05, 0.05, 0.27], "radius": 0.01, "speed": 2.0, "from": 0.0, "limit": 3}

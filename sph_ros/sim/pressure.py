@@ -32,7 +32,9 @@ class Goal(NamedTuple):
     most: float = np.inf
 
 
-def solve_pressures(work, densities, gradients, compliance, goal, share, displaced=False):
+def solve_pressures(
+    work, densities, gradients, compliance, goal, share, coupling=None, displaced=False
+):
     """Scaled pressures that hold the density, and the displacements they cause.
 
     Args:
@@ -43,6 +45,7 @@ def solve_pressures(work, densities, gradients, compliance, goal, share, displac
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.
         share: of the Jacobi correction to take.
+        coupling: `Coupling` with the free bodies, which keeps `work.yielded` up to date.
         displaced: whether `displacements` are already those of the first guess.
 
     Returns:
@@ -59,12 +62,15 @@ def solve_pressures(work, densities, gradients, compliance, goal, share, displac
             relax.pressure_displacements(
                 work.pairs, work.guesses, gradients, work.cohesive, work.displacements
             )
+        if coupling is not None:
+            coupling.respond(work.guesses)
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
         relax.correct_pressures(
             work.pairs,
             densities,
             gradients,
             work.displacements,
+            work.yielded,
             work.diagonal,
             compliance,
             np.float32(share),

@@ -7,6 +7,7 @@ from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import relaxation as relax
 from sph_ros.core.weights import DENSITY_POWER
+from sph_ros.sim.coupling import Coupling
 from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
 from sph_ros.sim.scales import packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
@@ -16,6 +17,9 @@ from sph_ros.sim.viscosity import apply_viscosity
 #: neighbour: (1 - r/h) summed over the layers of the lattice in its place, a third of it along the
 #: wall.
 WALL_LAYERS = 10.0
+
+#: For the part of the push on solids that is pressure alone.
+NO_TENSION = relax.Tension(*[np.float32(0.0)] * 4)
 
 
 class PressureSolver(Solver):
@@ -32,6 +36,7 @@ class PressureSolver(Solver):
         super().__init__(scene, solids, depth)
         self._packing = packing(scene, 0.0)
         self._share = FIRST_SHARE
+        self._coupling = None
 
     def set_material(self, material):
         """Use another material from the next substep on."""
@@ -94,8 +99,8 @@ class PressureSolver(Solver):
             np.float32(self._material.adhesion),
         )
 
-    def _pull_together(self, tension):
-        """Displacements by surface tension, into `cohesive`."""
+    def _pull_together(self, tension, time_step):
+        """Displacements by surface tension, into `cohesive`, and the reactions to them."""
         work, scales = self._work, self.scales
         if scales.cohesion > 0.0:
             ratio = 1.5 * scales.near_scale / (scales.density_scale * self._packing)
@@ -107,27 +112,57 @@ class PressureSolver(Solver):
                 np.float32(ratio),
                 work.cohesive,
             )
+            work.guesses[:] = 0.0
+            self._book_push(work.guesses, tension, time_step)
         else:
             work.cohesive[:] = 0.0
 
-    def _iterate(self, densities, compliance, goal, displaced=False):
-        """Pressures from the guess in `scaled`, and displacements; see `solve_pressures`."""
+    def _couple(self, centres, time_step):
+        """Collect the contacts with free bodies, whose centres of mass (B, 3) are as given."""
+        bodies, work = self._solids.bodies, self._work
+        self._coupling = None
+        if len(bodies):
+            self._coupling = Coupling(
+                bodies,
+                work.contacts,
+                work.predicted,
+                centres,
+                impulse_scale=self.scales.mass / time_step,
+                motion_scale=time_step,
+                yielded=work.yielded,
+            )
+
+    def _push_bodies(self, centres=None):
+        """Let the free bodies have what was booked since the last call."""
+        if len(self._solids.bodies):
+            self._solids.bodies.take(self._work.reactions.sum(axis=0), centres)
+
+    def _iterate(self, densities, compliance, goal, time_step, displaced=False):
+        """Pressures from the guess in `scaled`, displacements and the solids' reactions.
+
+        See `solve_pressures`. Free bodies must have had all pushes but this.
+        """
         work = self._work
         gradients = work.contacts.gradients
         relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
+        if self._coupling is not None:
+            self._coupling.add_diagonal(work.diagonal)
         self.iterations, self.density_error, self._share = solve_pressures(
-            work, densities, gradients, compliance, goal, self._share, displaced
+            work, densities, gradients, compliance, goal, self._share, self._coupling, displaced
         )
+        self._book_push(work.scaled, NO_TENSION, time_step)
 
-    def _react_to_pressures(self, tension, time_step):
-        """Book what the solids gave to the liquid by pressure and surface tension."""
+    def _book_push(self, pressures, tension, time_step):
+        """Book what the solids gave to the liquid by pressures [m^2] and surface tension."""
         work = self._work
+        if not len(self._solids):
+            return
         touch.pressure_reactions(
             work.predicted,
             work.contacts,
             self._solids.motion,
             work.sums,
-            work.scaled,
+            pressures,
             tension,
             np.float32(self.scales.mass / time_step**2),
             work.reactions,
@@ -146,15 +181,22 @@ class PressureSolver(Solver):
             scales.neighbors,
         )
         if len(self._solids):
-            touch.rub_on_solids(
-                work.predicted,
-                work.contacts,
-                self._solids.motion,
-                np.float32(
-                    WALL_LAYERS * self._material.wall_friction * scales.viscous_rate * time_step
-                ),
-                np.float32(self._material.wall_friction * time_step / self._scene.spacing),
-                np.float32(scales.mass / time_step),
-                fluid.velocities,
-                work.reactions,
-            )
+            self._rub(fluid, time_step)
+
+    def _rub(self, fluid, time_step):
+        """Friction on solids; free ones are dragged along."""
+        work, material = self._work, self._material
+        rate = WALL_LAYERS * material.wall_friction * self.scales.viscous_rate * time_step
+        drag = material.wall_friction * time_step / self._scene.spacing
+        if self._coupling is not None:
+            self._coupling.drag_along(fluid.velocities, rate, drag, self.scales.mass)
+        touch.rub_on_solids(
+            work.predicted,
+            work.contacts,
+            self._solids.motion,
+            np.float32(rate),
+            np.float32(drag),
+            np.float32(self.scales.mass / time_step),
+            fluid.velocities,
+            work.reactions,
+        )

@@ -53,6 +53,7 @@ class RelaxationSolver(PressureSolver):
         self._finish(fluid, time_step)
         self._clock("finish")
         self._apply_viscosity(fluid, time_step)
+        self._push_bodies()
         self._clock("viscosity")
         self._listed = fluid
         return self._work.reactions.sum(axis=0)
@@ -120,13 +121,15 @@ class RelaxationSolver(PressureSolver):
         work = self._work
         unit = self._pressure_unit(time_step)
         tension = self._tension(unit)
-        self._pull_together(tension)
+        self._pull_together(tension, time_step)
+        self._couple(self._solids.bodies.centre, time_step)
+        self._push_bodies()
         compliance = np.float32(1.0 / (self.scales.stiffness * unit))
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
         goal = Goal(TOLERANCE * self._material.compression)
-        self._iterate(work.sums.density, compliance, goal)
+        self._iterate(work.sums.density, compliance, goal, time_step)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
-        self._react_to_pressures(tension, time_step)
+        self._push_bodies()
 
     def _finish(self, fluid, time_step):
         """Relaxed positions outside all solids, and the velocities that follow from them."""
@@ -135,12 +138,10 @@ class RelaxationSolver(PressureSolver):
             work.predicted, work.displacements, np.float32(0.5) * self._h, work.starts
         )
         ends = work.starts
-        still = self._solids.motion._replace(
-            old_position=self._solids.motion.position, old_rotation=self._solids.motion.rotation
-        )
-        # From the predicted position, which is beside the solids as they are now.
+        # From the predicted position, which is beside the solids as they were until now.
+        motion, travel = self._solids.finish()
         self._keep_outside(
-            work.predicted, ends, fluid.positions, fluid.clearance, 0.0, still, time_step
+            work.predicted, ends, fluid.positions, fluid.clearance, travel, motion, time_step
         )
         relax.velocities_from_positions(
             fluid.positions, ends, np.float32(1.0 / time_step), fluid.velocities, work.errors

@@ -19,6 +19,7 @@ from sph_ros.sim.liquid import (
     fill_liquid,
     lattice_counts,
 )
+from sph_ros.sim.mass import mass_properties
 from sph_ros.sim.materials import MATERIALS, Material
 from sph_ros.sim.scene_types import SOLVERS, Emitter, Keyframe, LiquidBlock, Scene, Sink, SolidSpec
 from sph_ros.sim.scene_yaml import Node, SceneError, build, check_keys, nearest, read_dict
@@ -386,6 +387,9 @@ def _check_solids(scene: Scene, root: Node) -> None:
                 f"{len(positions)} particles start inside it, the deepest by "
                 f"{-distance[deepest]:.4g} m at {place}"
             )
+        if solid.control == "free":
+            weigh = (solid.shape, scene.dimension, solid.density, solid.mass)
+            _checked(node, lambda w=weigh: mass_properties(*w))
 
 
 def _item(root: Node, key: str, index: int) -> Node:

@@ -17,14 +17,23 @@ from sph_ros.sim.quantities import (
     replace_fields,
     unit_vector,
 )
-from sph_ros.sim.shapes import Box, Capsule, Cylinder, Plane, Pose, Shape, Sphere
+from sph_ros.sim.shapes import (
+    Box,
+    Capsule,
+    Container,
+    Cylinder,
+    OpenSurface,
+    Plane,
+    Pose,
+    Shape,
+    Sphere,
+)
 
 #: Names of the solvers (`sim.solvers` says what they are).
 SOLVERS = ("relaxation", "forces", "incompressible")
 
 #: Who moves a solid.
-CONTROLS = ("fixed", "topic", "path")
-PLANNED_CONTROLS = ("free",)
+CONTROLS = ("fixed", "topic", "path", "free")
 
 LIQUID_SHAPES = (Box, Sphere, Cylinder, Capsule)
 SINK_SHAPES = (*LIQUID_SHAPES, Plane)
@@ -154,9 +163,16 @@ class SolidSpec:
         name: unique; part of topic names.
         shape: in the solid's own frame.
         pose: of the solid's frame in the scene's frame, at the start.
-        control: "fixed", "topic" (pose messages, mouse, move_solid) or "path" (keyframes).
+        control: "fixed", "topic" (pose messages, mouse, move_solid), "path" (keyframes) or "free"
+            (a rigid body that the liquid, gravity and touches move).
         path: keyframes, for control "path".
-        density: mass per volume [kg/m^3], for bodies that float.
+        density: mass per volume [kg/m^3], for control "free"; or
+        mass: of the whole solid, spread evenly over its volume [kg], in 2D per metre of depth.
+        velocity: of the solid's origin at the start [m/s], for control "free".
+        angular_velocity: at the start [rad/s], scene's frame, for control "free".
+        friction: coefficient of friction with other solids; where two touch, the root of both
+            counts.
+        restitution: share of the speed that is left when a free solid bounces; the larger of two.
         color: red, green, blue, 0 to 1; chosen by whoever draws unless given.
         visible: drawn or not; it acts on the liquid either way.
     """
@@ -167,6 +183,11 @@ class SolidSpec:
     control: str = "fixed"
     path: tuple[Keyframe, ...] = ()
     density: float | None = quantity("kg/m^3", None, above=0.0, high=1e5)
+    mass: float | None = quantity("kg", None, above=0.0, high=1e9)
+    velocity: Vector = quantity("m/s", (0.0, 0.0, 0.0), low=-100.0, high=100.0)
+    angular_velocity: Vector = quantity("rad/s", (0.0, 0.0, 0.0), low=-1000.0, high=1000.0)
+    friction: float = quantity("1", 0.3, low=0.0, high=10.0)
+    restitution: float = quantity("1", 0.0, low=0.0, high=1.0)
     color: Vector | None = quantity("1", None, low=0.0, high=1.0)
     visible: bool = True
 
@@ -177,14 +198,35 @@ class SolidSpec:
                 "name: expected a letter, then letters, digits or _ (it becomes part of a topic), "
                 f"got {self.name!r}"
             )
-        if self.control in PLANNED_CONTROLS:
-            raise ValueError(f"control: {self.control!r} is not available yet; {CONTROLS} are")
         if self.control not in CONTROLS:
             raise ValueError(f"control: expected one of {CONTROLS}, got {self.control!r}")
         if not isinstance(self.visible, bool):
             raise ValueError(f"visible: expected true or false, got {self.visible!r}")
         check_quantities(self)
         self._check_path()
+        self._check_body()
+
+    def _check_body(self):
+        if self.density is not None and self.mass is not None:
+            raise ValueError(
+                f"mass: expected density or mass, got both ({self.density:g} kg/m^3, "
+                f"{self.mass:g} kg)"
+            )
+        if self.control == "free":
+            if self.density is None and self.mass is None:
+                raise ValueError(
+                    "density: expected a density [kg/m^3] or a mass [kg], because control is free; "
+                    "got neither"
+                )
+            if isinstance(self.shape, Plane | Container | OpenSurface):
+                kind = type(self.shape).__name__
+                raise ValueError(f"control: a {kind} has no definite volume, so it cannot be free")
+            return
+        for field in ("velocity", "angular_velocity"):
+            if any(getattr(self, field)):
+                raise ValueError(
+                    f"{field}: only a free solid starts with one, got control {self.control!r}"
+                )
 
     def _check_path(self):
         times = [keyframe.time for keyframe in self.path]

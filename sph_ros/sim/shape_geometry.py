@@ -41,7 +41,7 @@ def bounding_radius(shape: Shape) -> float:
 
     For a container this is the size of the inner shape.
     """
-    lower, upper = _extent(shape)
+    lower, upper = extent(shape)
     if isinstance(shape, Sphere):
         return shape.radius
     if isinstance(shape, Capsule):
@@ -72,7 +72,7 @@ def _placed_radius(part: Placed) -> float:
     return float(np.linalg.norm(part.pose.position)) + bounding_radius(part.shape)
 
 
-def _extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+def extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box along the axes that holds the shape [m]."""
     if isinstance(shape, Box):
         return np.array(shape.min), np.array(shape.max)
@@ -88,13 +88,13 @@ def _extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         vertices, _ = _triangles(shape)
         return vertices.min(axis=0), vertices.max(axis=0)
     elif isinstance(shape, Container):
-        return _extent(shape.shape)
+        return extent(shape.shape)
     else:
         parts = shape.of if isinstance(shape, Union) else shape.of[:1]
         extents = [placed_extent(part.shape, part.pose) for part in parts]
         return (
-            np.min([extent[0] for extent in extents], axis=0),
-            np.max([extent[1] for extent in extents], axis=0),
+            np.min([corners[0] for corners in extents], axis=0),
+            np.max([corners[1] for corners in extents], axis=0),
         )
     return -half, half
 
@@ -104,7 +104,7 @@ def placed_extent(shape: Shape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
 
     Infinite for planes; for a container that of the inner shape.
     """
-    lower, upper = _extent(shape)
+    lower, upper = extent(shape)
     if not np.isfinite(upper - lower).all():
         return np.full(3, -math.inf), np.full(3, math.inf)
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
@@ -131,7 +131,7 @@ def volume(shape: Shape) -> float:
         return math.inf
     if isinstance(shape, OpenSurface):
         return 0.0
-    lower, upper = _extent(shape)
+    lower, upper = extent(shape)
     if not np.isfinite(upper - lower).all():
         return math.inf
     if isinstance(shape, Mesh):
@@ -144,7 +144,7 @@ def volume(shape: Shape) -> float:
 @lru_cache(maxsize=32)
 def _sampled(shape: Shape, samples: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Signed distance of a bounded shape around its material: (samples, origin (3,), cell) [m]."""
-    lower, upper = _extent(shape)
+    lower, upper = extent(shape)
     cell = float((upper - lower).max()) / samples
     origin = lower - 1.5 * cell
     counts = np.ceil((upper - lower) / cell).astype(int) + 4
@@ -221,7 +221,7 @@ def _extracted(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """The zero surface of the sampled distance; empty when nothing is left of a difference."""
     from skimage.measure import marching_cubes
 
-    if not np.isfinite(np.concatenate(_extent(shape))).all():
+    if not np.isfinite(np.concatenate(extent(shape))).all():
         raise ValueError(f"{type(shape).__name__.lower()}: cannot draw a shape without end")
     distance, origin, cell = _sampled(shape, _SURFACE_SAMPLES)
     if not distance.min() < 0.0 < distance.max():

@@ -162,9 +162,8 @@ class Simulation:
     def _substep_count(self):
         """Substeps that keep solids and particles within their reach, and the liquid stable."""
         dt = self.time_step
-        ahead = min(
-            self._solids.distance_ahead(self.time, dt, self._liquid_reach()),
-            self.scene.max_solid_speed * dt,
+        ahead = self._solids.distance_ahead(
+            self.time, dt, self.scene.max_solid_speed, self._liquid_reach()
         )
         particle = max(self._solver.fastest, self._emitters.fastest(self.time)) * dt
         wanted = max(
@@ -208,6 +207,7 @@ class Simulation:
             "next_id": self._next_id,
             "emitters": self._emitters.state(),
             "sinks": self._sinks.state(),
+            "bodies": self._solids.bodies.state(),
         }
 
     @classmethod
@@ -230,9 +230,7 @@ class Simulation:
         simulation.time_step, simulation.time_step_reason = numbers["time_step"]
         simulation._substeps = numbers["substeps"]
         simulation._reactions[:] = numbers["reactions"]
-        for name, state in numbers["solids"].items():
-            simulation._solids[name].set_state(state)
-        simulation._solids.settle()
+        simulation._solids.set_state(numbers)
         return simulation
 
     # ---------------------------------------------------------------- liquid
@@ -319,18 +317,24 @@ class Simulation:
         later than those that wait replaces them.
 
         Args:
-            name: of a solid whose control is not `fixed`.
+            name: of a solid whose control is `topic` or `path`.
             position: of its origin, world frame [m], (3,).
             quat_xyzw: world from solid; normalised here.
             time: simulated time of arrival [s]; None or a past one: the end of the next step.
 
         Raises:
             KeyError: there is no such solid.
-            ValueError: the solid is fixed, or the pose is not finite, or the quaternion is zero.
+            ValueError: the solid is fixed or free, or the pose is not finite, or the quaternion is
+                zero.
         """
         solid = self._solids[name]
         if solid.control == "fixed":
             raise ValueError(f"{name}: this solid is fixed; give it `control: topic` to move it")
+        if solid.control == "free":
+            raise ValueError(
+                f"{name}: this solid is free: the liquid, gravity and touches move it; give it "
+                "`control: topic` to move it by poses"
+            )
         soonest = self.time + self.time_step
         if time is None or time < soonest:
             time = soonest
@@ -368,12 +372,14 @@ class Simulation:
             (those outside a container or no longer finite, and those that were removed because they
             got far away from everything), squeezed_particles (rescued from between solids in the
             last step), substeps and iterations of the last step, density_error (mean, left by the
-            last iteration, -). In 2D energies and momenta are per metre of depth.
+            last iteration, -), solid_momentum (3,) [kg m/s] and solid_energy (kinetic, [J]) of the
+            free solids. In 2D energies and momenta are per metre of depth.
         """
         velocities = self._fluid.velocities.astype(np.float64)
         mass = self._solver.scales.mass
         excess = np.maximum(self._relative_densities() - 1.0, 0.0)
         square = np.einsum("ij,ij->i", velocities, velocities)
+        solid_momentum, solid_energy = self._solids.bodies.facts()
         return {
             "time": self.time,
             "particle_count": len(self._fluid),
@@ -389,6 +395,8 @@ class Simulation:
             "substeps": self._substeps,
             "iterations": self._solver.iterations,
             "density_error": self._solver.density_error,
+            "solid_momentum": solid_momentum,
+            "solid_energy": solid_energy,
         }
 
     def _lost_count(self):

@@ -16,6 +16,7 @@ from sph_ros.core.distances import signed_distances
 from sph_ros.core.sheets import CORNER_CONTACTS, sheet_distances
 from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim import quaternions
+from sph_ros.sim.bodies import Bodies
 from sph_ros.sim.shapes import bounding_radius, display_mesh, pack_shapes
 from sph_ros.sim.sheets import pack_sheets
 
@@ -102,6 +103,13 @@ class Solid:
             )
             for frame in self._spec.path
         )
+
+    def place(self, position, quat_xyzw, velocity, angular_velocity):
+        """Take a pose and velocities at once, all float64 arrays; for free solids."""
+        for array in (position, quat_xyzw):
+            array.setflags(write=False)
+        self.position, self.quat_xyzw = position, quat_xyzw
+        self.velocity, self.angular_velocity = velocity, angular_velocity
 
     def state(self):
         """What changes, as lists of numbers."""
@@ -244,6 +252,7 @@ class Solids:
         slots: contacts that a particle can have at most.
         motion: `Motion`, poses at the start and the end of the present substep.
         travel: the farthest that a point of any solid moves in the present substep [m].
+        bodies: the free ones among them, `Bodies`.
     """
 
     def __init__(self, scene, weights=POWERS):
@@ -267,6 +276,7 @@ class Solids:
             spec.name: Solid(spec, self.packed, self.sheets, index, scene.dimension)
             for index, spec in enumerate(specs)
         }
+        self.bodies = Bodies(scene, list(self), self.packed)
         count = len(specs)
         self.motion = Motion(
             np.zeros((count, 3), np.float32),
@@ -304,6 +314,7 @@ class Solids:
         """All solids back to the scene's poses."""
         for solid in self:
             solid.reset()
+        self.bodies.reset()
         self.settle()
 
     def settle(self):
@@ -313,22 +324,59 @@ class Solids:
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
 
-    def distance_ahead(self, now, duration, liquid_reach):
-        """The farthest that a point of any solid would move in the next `duration` [s] [m]."""
-        return max(
-            (solid.distance_ahead(now, duration, liquid_reach) for solid in self), default=0.0
+    def set_state(self, numbers):
+        """Go on from a snapshot: `state` of each solid by name in `solids`, that of `bodies`."""
+        for name, state in numbers["solids"].items():
+            self[name].set_state(state)
+        self.bodies.set_state(numbers["bodies"])
+        self.settle()
+
+    def distance_ahead(self, now, duration, max_speed, liquid_reach):
+        """The farthest that a point of any solid would move in the next `duration` [s] [m].
+
+        Solids that are driven are no faster than `max_speed` [m/s].
+        """
+        driven = max(
+            (
+                solid.distance_ahead(now, duration, liquid_reach)
+                for solid in self
+                if solid.control != "free"
+            ),
+            default=0.0,
         )
+        fallen = float(self.bodies.farthest(duration).max(initial=0.0))
+        return max(min(driven, max_speed * duration), fallen)
 
     def advance(self, now, duration, max_speed, liquid_reach):
         """Move all solids on for `duration` [s]; arguments as for one `Solid`."""
         self.motion.old_position[:] = self.motion.position
         self.motion.old_rotation[:] = self.motion.rotation
-        self.travel = 0.0
-        for solid in self:
-            if solid.control != "fixed":
-                way = solid.advance(now, duration, max_speed, liquid_reach)
-                self.travel = max(self.travel, way)
+        ways = np.zeros(len(self))
+        for index, solid in enumerate(self):
+            if solid.control in ("topic", "path"):
+                ways[index] = solid.advance(now, duration, max_speed, liquid_reach)
+        self._driven_way = float(ways.max(initial=0.0))
         self._write_poses(self.motion.position, self.motion.rotation)
+        ways[self.bodies.solids] = self.bodies.farthest(duration)
+        self.bodies.begin(duration, self.motion, ways)
+        self._take_poses()
+
+    def finish(self):
+        """Take free bodies to where the liquid lets them.
+
+        Returns:
+            `Motion` from the poses during the substep to those at its end, and the farthest that a
+            point of a solid moves on it [m].
+        """
+        before = self.motion.position.copy(), self.motion.rotation.copy()
+        way = self.bodies.finish()
+        self._take_poses()
+        return Motion(*before, self.motion.position, self.motion.rotation), way
+
+    def _take_poses(self):
+        """Let the substep end where the solids are now."""
+        self._write_poses(self.motion.position, self.motion.rotation)
+        self.travel = max(self._driven_way, float(self.bodies.ways().max(initial=0.0)))
 
     def _write_poses(self, position, rotation):
         for index, solid in enumerate(self):

@@ -143,7 +143,7 @@ class Workspace:
         predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
-        diagonal, scaled, guesses, targets: of the pressure iterations, (N,) float32.
+        diagonal, scaled, guesses, targets, yielded: of the pressure iterations, (N,) float32.
         errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
         totals: (chunks, 3) float64.
         reactions: wrench per chunk and solid, (chunks, S, 6) float64.
@@ -163,6 +163,7 @@ class Workspace:
         "scaled": (0, np.float32),
         "guesses": (0, np.float32),
         "targets": (0, np.float32),
+        "yielded": (0, np.float32),
     }
 
     def __init__(self, capacity, solids, slots=None, pairs_per_particle=44):
