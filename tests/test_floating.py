@@ -127,7 +127,7 @@ def test_balls_float_as_deep_as_archimedes_says_or_sink():
     for density in (500.0, 900.0):
         draft = brentq(lambda x, d=density: submerged(x) - d / 1000, 0, 1) * 2 * radius
         height = sim.solid(f"ball{density:.0f}").position[2]
-        print(density, height, level - draft + radius, (height - (level - draft + radius)) / .12)
+        print(density, height, level - draft + radius, (height - (level - draft + radius)) / 0.12)
         assert height == pytest.approx(level - draft + radius, abs=0.05 * 2 * radius)
     sunk = sim.solid("ball2000")
     print(sunk.position, sunk.velocity, sim.particle_count)
@@ -294,7 +294,12 @@ def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled
     while sim.time < 2.5:
         sim.step()
         heights.append(boat.position[2])
-        if len(heights) % 20 == 0: print(round(sim.time,2), boat.position.round(4), np.degrees(heel_and_trim(boat.quat_xyzw)).round(2))
+        if len(heights) % 20 == 0:
+            print(
+                round(sim.time, 2),
+                boat.position.round(4),
+                np.degrees(heel_and_trim(boat.quat_xyzw)).round(2),
+            )
     level = (sim.particle_count * 0.02**3 + 1.25 * hull.volume) / (0.6 * 0.36)
     print("keel", boat.position[2], "truth", level - draft, "level", level)
     turns = np.flatnonzero(np.diff(np.sign(np.diff(heights))))
@@ -307,8 +312,13 @@ def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled
     sim = sph_ros.Simulation(boat_scene(filled=True))
     while sim.time < 3.0:
         sim.step()
-        boat=sim.solid("boat")
-        if round(sim.time/sim.time_step) % 20 == 0: print(round(sim.time,2), boat.position.round(4), np.degrees(heel_and_trim(boat.quat_xyzw)).round(2))
+        boat = sim.solid("boat")
+        if round(sim.time / sim.time_step) % 20 == 0:
+            print(
+                round(sim.time, 2),
+                boat.position.round(4),
+                np.degrees(heel_and_trim(boat.quat_xyzw)).round(2),
+            )
     assert sim.solid("boat").position[2] < 0.02
     assert sim.statistics()["lost_particles"] == 0
 

@@ -11,12 +11,7 @@ from sph_ros.sim.coupling import Coupling
 from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
 from sph_ros.sim.scales import packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
-from sph_ros.sim.viscosity import apply_viscosity
-
-#: Viscosity between liquid and a solid that fills the support, as a multiple of that of one
-#: neighbour: (1 - r/h) summed over the layers of the lattice in its place, a third of it along the
-#: wall.
-WALL_LAYERS = 10.0
+from sph_ros.sim.viscosity import Rates, apply_viscosity
 
 #: For the part of the push on solids that is pressure alone.
 NO_TENSION = relax.Tension(*[np.float32(0.0)] * 4)
@@ -170,33 +165,19 @@ class PressureSolver(Solver):
 
     def _apply_viscosity(self, fluid, time_step):
         """Viscosity and friction, which change velocities only."""
-        work, scales = self._work, self.scales
-        slope = DENSITY_POWER * scales.density_scale * self._packing / float(self._h)
-        apply_viscosity(
-            work,
-            fluid.velocities,
-            slope,
-            scales.viscous_rate * time_step,
-            scales.quadratic * time_step,
-            scales.neighbors,
+        scales, friction = self.scales, self._material.wall_friction
+        rates = Rates(
+            slope=DENSITY_POWER * scales.density_scale * self._packing / float(self._h),
+            linear=scales.viscous_rate * time_step,
+            quadratic=scales.quadratic * time_step,
+            neighbors=scales.neighbors,
+            wall=scales.wall_layers * friction * scales.viscous_rate * time_step,
+            wall_quadratic=friction * time_step / self._scene.spacing,
+            inertia=scales.mass / time_step,
         )
-        if len(self._solids):
-            self._rub(fluid, time_step)
-
-    def _rub(self, fluid, time_step):
-        """Friction on solids; free ones are dragged along."""
-        work, material = self._work, self._material
-        rate = WALL_LAYERS * material.wall_friction * self.scales.viscous_rate * time_step
-        drag = material.wall_friction * time_step / self._scene.spacing
         if self._coupling is not None:
-            self._coupling.drag_along(fluid.velocities, rate, drag, self.scales.mass)
-        touch.rub_on_solids(
-            work.predicted,
-            work.contacts,
-            self._solids.motion,
-            np.float32(rate),
-            np.float32(drag),
-            np.float32(self.scales.mass / time_step),
-            fluid.velocities,
-            work.reactions,
-        )
+            # Free solids are dragged along by what they will rub on.
+            self._coupling.drag_along(
+                fluid.velocities, rates.wall, rates.wall_quadratic, scales.mass
+            )
+        apply_viscosity(self._work, fluid.velocities, rates, self._solids.motion)

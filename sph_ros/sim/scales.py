@@ -19,6 +19,10 @@ yield by the
 * Viscosity: pair forces -gamma (1 - q) along the line of centres make the shear viscosity
   mu = gamma n^2 / (2 d (d + 2)) integral of (1 - q) r^2 (Irving-Kirkwood; for d = 3 the well known
   2 pi / 15 of dissipative particle dynamics). The integral is a lattice sum here.
+* Friction: a wall that holds the liquid is lattice layers whose velocity mirrors the liquid's, so
+  that it is the wall's own in between. A particle half a spacing away feels the layer k spacings
+  below it move at 2 k times its sliding speed; only the part along the line of centres counts:
+  sum of (1 - q) cos^2 2 k, divided by the share of density that the wall has there.
 * Surface tension: the potential of the cohesive pressures is
   E = s^d sum_i [Kc / (2 G) (density - 1 - b)^2 + Kc b / (2 Gn) near_density^2] with b = Kn / Kc;
   the excess of the outermost lattice layers per area is the surface tension, linear in Kc.
@@ -66,6 +70,8 @@ class Scales:
         viscous_rate: linear impulse per relative speed and second [1/s].
         quadratic: quadratic impulse per squared relative speed and second [1/m].
         neighbors: (1 - r/h) summed over the lattice's neighbours, divided by the dimension [-].
+        wall_layers: viscous rate of a wall that holds the liquid, per wall fraction and that of a
+            pair [-].
     """
 
     mass: float
@@ -80,6 +86,7 @@ class Scales:
     viscous_rate: float
     quadratic: float
     neighbors: float
+    wall_layers: float
 
 
 def packing(scene, time):
@@ -128,6 +135,7 @@ def solver_scales(material, scene, depth):
         viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
         neighbors=sum(1 - r / h for r, _ in _neighbors(h, s, d) if r > 0.0) / d,
+        wall_layers=_wall_layers(h, s, d),
     )
 
 
@@ -150,6 +158,18 @@ def surface_energy(support_radius, spacing, dimension):
         energy = (density - 1 - b) ** 2 / (2 * virial) + b * near * near / (2 * near_virial)
         excess += spacing * (energy - bulk)
     return excess
+
+
+def _wall_layers(support_radius, spacing, dimension):
+    """Pair rates that a wall which holds the liquid is worth, per wall fraction [-]."""
+    reach = math.ceil(support_radius / spacing)
+    total = 0.0
+    for offset in itertools.product(range(-reach, reach + 1), repeat=dimension):
+        r = math.sqrt(sum(c * c for c in offset))
+        if offset[-1] > 0 and r * spacing < support_radius:
+            cosine = offset[0] / r
+            total += (1 - r * spacing / support_radius) * cosine**2 * 2 * offset[-1]
+    return total / _missing(DENSITY_POWER, support_radius, spacing, dimension, 0)
 
 
 def _neighbors(support_radius, spacing, dimension):

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Viscosity: impulses where they are stable, conjugate gradients where the liquid is too thick."""
 
+from typing import NamedTuple
+
 import numpy as np
 
+from sph_ros.core import contacts as touch
 from sph_ros.core import relaxation as relax
+from sph_ros.core.drag import add_drag, drag_reactions
 
 #: Share of its speed relative to all neighbours that a particle may lose explicitly in a step. A
 #: pair takes a share c along its line, so N neighbours all around take N c / dimension; from 1 on
@@ -14,53 +18,101 @@ EXPLICIT_LIMIT, MOST_TAKEN = 0.38, 0.5
 TOLERANCE, MOST_ITERATIONS = 1e-4, 100
 
 
-def apply_viscosity(work, velocities, slope, linear, quadratic, neighbors):
-    """Let pairs of neighbours share their velocities.
+class Rates(NamedTuple):
+    """How strongly liquid rubs on itself and on solids in one step.
+
+    Attributes:
+        slope: length of a pair's gradient divided by (1 - r/h) [1/m].
+        linear: impulse per relative speed [-].
+        quadratic: impulse per squared relative speed [s/m].
+        neighbors: (1 - r/h) summed over the neighbours in a lattice, by the dimension [-].
+        wall: impulse per sliding speed and wall fraction [-].
+        wall_quadratic: impulse per squared sliding speed and wall fraction [s/m].
+        inertia: particle mass / time step [kg/s].
+    """
+
+    slope: float
+    linear: float
+    quadratic: float
+    neighbors: float
+    wall: float
+    wall_quadratic: float
+    inertia: float
+
+
+def apply_viscosity(work, velocities, rates, motion):
+    """Let pairs of neighbours share their velocities, and solids take theirs.
 
     Args:
-        work: `Workspace` with pairs; its scratch arrays are used.
+        work: `Workspace` with pairs and contacts; its scratch arrays are used, its reactions added
+            to.
         velocities: [m/s], (N, 3); changed.
-        slope: length of a pair's gradient divided by (1 - r/h) [1/m].
-        linear: impulse per relative speed in this step [-].
-        quadratic: impulse per squared relative speed in this step [s/m].
-        neighbors: (1 - r/h) summed over the neighbours in a lattice, by the dimension [-].
+        rates: `Rates`.
+        motion: of the solids.
     """
-    implicit = linear * neighbors > EXPLICIT_LIMIT
-    if quadratic > 0.0 or (linear > 0.0 and not implicit):
+    implicit = rates.linear * rates.neighbors > EXPLICIT_LIMIT
+    if rates.quadratic > 0.0 or (rates.linear > 0.0 and not implicit):
         relax.viscous_impulses(
             work.pairs,
             velocities,
-            np.float32(slope),
-            np.float32(0.0 if implicit else linear),
-            np.float32(quadratic),
-            np.float32(MOST_TAKEN / neighbors),
+            np.float32(rates.slope),
+            np.float32(0.0 if implicit else rates.linear),
+            np.float32(rates.quadratic),
+            np.float32(MOST_TAKEN / rates.neighbors),
             work.scratch,
         )
         velocities[:] = work.scratch
+    touching = len(motion.position) > 0
     if implicit:
-        solve_implicitly(work, velocities, np.float32(slope), np.float32(linear))
+        _solve_implicitly(work, velocities, rates, touching)
+        if touching:
+            drag_reactions(
+                work.predicted,
+                work.contacts,
+                motion,
+                np.float32(rates.wall),
+                np.float32(rates.inertia),
+                velocities,
+                work.reactions,
+            )
+    if touching:
+        touch.rub_on_solids(
+            work.predicted,
+            work.contacts,
+            motion,
+            np.float32(0.0 if implicit else rates.wall),
+            np.float32(rates.wall_quadratic),
+            np.float32(rates.inertia),
+            velocities,
+            work.reactions,
+        )
 
 
-def solve_implicitly(work, velocities, slope, linear):
+def _solve_implicitly(work, velocities, rates, touching):
     """Conjugate gradients for v - impulses(v) = present v, starting from the present v."""
     direction, image, residual = work.cohesive, work.scratch, work.displacements
+    slope, linear, wall = (np.float32(x) for x in (rates.slope, rates.linear, rates.wall))
 
     def dot(a, b):
         relax.chunk_dots(a, b, work.errors)
         return float(work.errors.sum())
 
-    def apply(v):
+    def apply(v, moving):
         relax.viscous_operator(work.pairs, v, slope, linear, image)
+        if touching:
+            add_drag(work.contacts, wall, np.float32(moving), v, image)
 
-    apply(velocities)
+    # The surfaces' velocities belong to the right side; taken with the first image they end up
+    # there.
+    apply(velocities, 1.0)
     np.subtract(velocities, image, out=residual)
     direction[:] = residual
     square = dot(residual, residual)
-    goal = TOLERANCE**2 * max(dot(velocities, velocities), 1e-30)
+    goal = TOLERANCE**2 * max(dot(velocities, velocities), square, 1e-30)
     for _ in range(MOST_ITERATIONS):
         if square <= goal:
             break
-        apply(direction)
+        apply(direction, 0.0)
         share = np.float32(square / dot(direction, image))
         velocities += share * direction
         residual -= share * image
