@@ -195,7 +195,7 @@ def thick_scene(density):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_body_much_lighter_than_honey_settles(solver):
-    """Added mass and friction outweigh it many times: taking turns with the liquid would explode."""
+    """Added mass and friction outweigh it: taking turns with the liquid would explode."""
     sim = sph_ros.Simulation({**thick_scene(50.0), "solver": solver})
     fastest = 0.0
     while sim.time < 1.2:
