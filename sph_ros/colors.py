@@ -12,6 +12,10 @@ CONTAINER = (0.70, 0.70, 0.70, 0.15)
 #: Of solids for which the scene gives none, in turn: red, green, blue.
 SOLIDS = ((0.90, 0.48, 0.32), (0.93, 0.76, 0.32), (0.48, 0.69, 0.38), (0.62, 0.46, 0.73))
 
+# Where the sun is, how dark the dark side is, how strong and how small the gleam is.
+_SUN = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
+_LEAST_LIGHT, _BRIGHTNESS, _GLEAM, _GLOSS = 0.35, 1.15, 0.55, 24.0
+
 # Deep blue at rest, over light blue to white foam: share of the highest speed, red, green, blue.
 _SPEED_STOPS = np.array(
     [
@@ -45,6 +49,24 @@ def speed_colors(shares):
     shares = np.clip(np.nan_to_num(np.asarray(shares, float), posinf=1.0, neginf=0.0), 0.0, 1.0)
     at, stops = _SPEED_STOPS[:, 0], _SPEED_STOPS[:, 1:]
     return np.stack([np.interp(shares, at, stops[:, c]) for c in range(3)], axis=1)
+
+
+def shaded_liquid(normals):
+    """The liquid's colour lit from above, for viewers that cannot shade smoothly by themselves.
+
+    Args:
+        normals: unit outward normals, (V, 3), z up.
+
+    Returns:
+        red, green, blue, alpha (V, 4) float32: light from the sky and a soft gleam of the sun.
+    """
+    toward_sun = normals @ _SUN
+    light = _LEAST_LIGHT + (1.0 - _LEAST_LIGHT) * (0.5 + 0.5 * toward_sun)
+    gleam = _GLEAM * np.maximum(toward_sun, 0.0) ** _GLOSS
+    colors = np.ones((len(normals), 4), np.float32)
+    colors[:, :3] = light[:, None] * np.array(LIQUID[:3]) * _BRIGHTNESS
+    colors[:, :3] += gleam[:, None] * (1.0 - colors[:, :3])
+    return np.minimum(colors, 1.0)
 
 
 def linear(rgb):

@@ -102,7 +102,7 @@ class BagRecorder:
             wrench = wrench_to_cdr(*sim.wrench(name), stamp, self._frame_id)
             write(f"solids/{name}/wrench", WRENCH_STAMPED, wrench)
         if self._count % 2 == 0:
-            marker = surface_marker(*surface[:2], stamp, self._frame_id)
+            marker = surface_marker(*surface, stamp, self._frame_id)
             write("surface", MARKER, marker_to_cdr(marker))
             write("solids", MARKER_ARRAY, markers_to_cdr(self._solids.at(stamp)))
         self._count += 1

@@ -2,20 +2,31 @@
 """A simulation as markers, the same on topics and in bags: the liquid's surface and the solids."""
 
 from msg_adapters.marker import triangle_marker
-from sph_ros.colors import LIQUID, solid_colors
+from sph_ros.colors import LIQUID, shaded_liquid, solid_colors
 
 
-def surface_marker(vertices, triangles, stamp_ns, frame_id):
+def surface_marker(vertices, triangles, normals, stamp_ns, frame_id):
     """The liquid's surface; a marker that deletes it where there are no triangles.
+
+    A marker has no normals, and RViz shades every triangle by its own: each would show. So every
+    vertex gets its shade as a colour, which switches RViz's light off. The surface is opaque,
+    because RViz draws transparent triangles in the order of the message, far ones over near ones.
 
     Args:
         vertices: [m], (V, 3).
         triangles: (T, 3).
+        normals: of the vertices, unit and outward, (V, 3).
         stamp_ns: [ns].
         frame_id: of the vertices.
     """
     return triangle_marker(
-        vertices, triangles, stamp_ns, frame_id, namespace="surface", color=LIQUID
+        vertices,
+        triangles,
+        stamp_ns,
+        frame_id,
+        namespace="surface",
+        color=LIQUID[:3],
+        vertex_colors=shaded_liquid(normals),
     )
 
 

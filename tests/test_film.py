@@ -76,8 +76,24 @@ def test_markers_show_visible_solids_where_they_are():
     assert {marker.frame_id for marker in markers.values()} == {"pool"}
     assert [marker.marker_id for marker in markers.values()] == [0, 2, 3]
     assert colors["wall"] == CONTAINER and colors["floor"] != colors["plain"]
-    empty = surface_marker(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 5, "pool")
+    empty = surface_marker(
+        np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)), 5, "pool"
+    )
     assert empty.action == DELETE and empty.namespace == "surface"
+
+
+def test_the_surface_is_shaded_smoothly_and_opaque():
+    vertices = np.random.default_rng(1).normal(size=(500, 3))
+    vertices /= np.linalg.norm(vertices, axis=1)[:, None]  # on a sphere; outward normals, too
+    triangles = np.arange(498, dtype=np.int32).reshape(-1, 3)
+    marker = surface_marker(vertices, triangles, vertices, 5, "pool")
+    assert marker.colors.shape == (498, 4) and (marker.colors[:, 3] == 1.0).all()
+    assert marker.colors.min() >= 0.0 and marker.colors.max() <= 1.0
+    # Lit from above: the brightest are next to each other, the darkest are on the other side.
+    order = np.argsort(marker.colors[:, :3].sum(axis=1))
+    bright, dark = marker.points[order[-20:]], marker.points[order[:20]]
+    assert bright[:, 2].min() > 0.5 > -0.5 > dark[:, 2].max()
+    assert np.linalg.norm(bright.mean(axis=0)) > 0.9
 
 
 def test_speeds_go_from_deep_blue_to_white_and_stand_nan():

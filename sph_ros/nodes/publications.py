@@ -95,11 +95,11 @@ class Publications:
     def surface(self, job):
         """Extract and publish a surface; returns its number of triangles. For any thread."""
         scene = job.scene
-        vertices, triangles, _ = extract_surface(
+        vertices, triangles, normals = extract_surface(
             job.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
         )
         if _heard(self._surface):
-            marker = surface_marker(vertices, triangles, job.stamp_ns, scene.frame)
+            marker = surface_marker(vertices, triangles, normals, job.stamp_ns, scene.frame)
             self._surface.publish(marker_to_cdr(marker))
         if _heard(self._surface_mesh):
             self._surface_mesh.publish(mesh_to_cdr(vertices, triangles))
