@@ -340,7 +340,7 @@ def test_without_the_world_marker_there_is_no_pose_and_a_clear_word():
     for k in range(10):
         result = tracker.track(seen(BALL, ball, rng), CAMERA, k / FPS)
         assert result.solids["ball"].pose is None and result.solids["ball"].status == "no world"
-        assert "never seen" in result.problems[0]
+        assert "never seen" in result.problems[0].text
     for k in range(10, 20):
         found = seen(BALL, ball, rng) + seen(WORLD, CAMERA_FROM_WORLD, rng)
         result = tracker.track(found, CAMERA, k / FPS)
@@ -360,8 +360,8 @@ def test_the_same_id_twice_uses_the_one_that_was_there():
     world = seen(WORLD, CAMERA_FROM_WORLD, rng, 0.0)
     here, there = (seen(BALL, CAMERA_FROM_WORLD @ p, rng, 0.0) for p in (pose, other))
     result = tracker.track(world + there + here, CAMERA, 0.0)
-    assert result.solids["ball"].pose is None and "seen 2 times" in result.problems[0]
+    assert result.solids["ball"].pose is None and "seen 2 times" in result.problems[0].text
     tracker.track(world + here, CAMERA, 1 / FPS)
     result = tracker.track(world + there + here, CAMERA, 2 / FPS)
     assert np.allclose(result.solids["ball"].pose.position, pose.position, atol=1e-3)
-    assert "nearest" in result.problems[0]
+    assert "nearest" in result.problems[0].text

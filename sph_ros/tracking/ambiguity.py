@@ -6,11 +6,13 @@ alone hold against it adds up over pictures, slowly forgotten; only when it exce
 other solution win against the prediction, and the track starts over from there.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from sph_ros.core.motion_filter import squared_distance
 from sph_ros.tracking.pose import Solution
 from sph_ros.tracking.se3 import difference
 
@@ -83,11 +85,12 @@ class PoseChooser:
         if len(solutions) == 1:
             self.evidence *= settings.memory
             return Choice(solutions[0], False)
-        fits = np.array([solution.chi_squared for solution in solutions])
-        costs = fits + self._distances(solutions, prediction)
-        chosen = int(np.argmin(costs))
-        against = float(np.clip(fits[chosen] - fits[1 - chosen], -settings.one_picture,
-                                settings.one_picture))  # fmt: skip
+        fits = [solution.chi_squared for solution in solutions]
+        distances = self._distances(solutions, prediction)
+        costs = [fit + distance for fit, distance in zip(fits, distances, strict=True)]
+        chosen = 0 if costs[0] <= costs[1] else 1
+        against = fits[chosen] - fits[1 - chosen]
+        against = max(-settings.one_picture, min(settings.one_picture, against))
         self.evidence = max(settings.memory * self.evidence + against, -settings.confidence)
         flipped = self.evidence > self._bound()
         if flipped:
@@ -104,21 +107,22 @@ class PoseChooser:
     def _distances(self, solutions, prediction):
         """Squared Mahalanobis distances from the prediction, at most `trust`."""
         if prediction is None:
-            return np.zeros(len(solutions))
+            return [0.0] * len(solutions)
         distances = []
         for solution in solutions:
             error = difference(solution.pose, prediction.pose)
             spread = prediction.covariance + solution.covariance
-            distances.append(float(error @ np.linalg.solve(spread, error)))
+            distances.append(squared_distance(error, spread))
         least = min(distances)
         # Relative to the nearer one: a motion that surprises both must not drown the corners.
-        return np.minimum(np.array(distances) - least, self._settings.trust)
+        return [min(distance - least, self._settings.trust) for distance in distances]
 
 
 def _with_doubt(solutions, costs, chosen):
     """The chosen solution; its covariance also holds the chance that the other is right."""
     solution, other = solutions[chosen], solutions[1 - chosen]
-    chance = 1.0 / (1.0 + np.exp(np.clip(0.5 * (costs[1 - chosen] - costs[chosen]), -50.0, 50.0)))
+    advantage = 0.5 * (costs[1 - chosen] - costs[chosen])
+    chance = 1.0 / (1.0 + math.exp(max(-50.0, min(50.0, advantage))))
     error = difference(other.pose, solution.pose)
     covariance = solution.covariance + chance * np.outer(error, error)
     return solution._replace(covariance=covariance)

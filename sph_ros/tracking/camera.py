@@ -5,9 +5,10 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import yaml
+
+from sph_ros.core.pinhole import projected
 
 #: Field of view across the picture that is assumed without a calibration [degrees].
 GUESSED_FIELD_OF_VIEW = 60.0
@@ -29,6 +30,7 @@ class CameraModel:
         matrix: K, (3, 3) [pixels].
         distortion: OpenCV's k1 k2 p1 p2 k3 ..., (n,).
         approximate: whether it is a guess, so that distances are approximate.
+        lens: the same for kernels: K, twelve coefficients, projection of a tilted sensor (3, 3).
     """
 
     width: int
@@ -36,6 +38,7 @@ class CameraModel:
     matrix: np.ndarray
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     approximate: bool = False
+    lens: tuple = field(init=False, repr=False)
 
     def __post_init__(self):
         matrix = np.array(self.matrix, float)
@@ -50,6 +53,7 @@ class CameraModel:
         matrix.flags.writeable = distortion.flags.writeable = False
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "lens", (matrix, *_lens(distortion)))
 
     def check_size(self, width, height):
         """CameraError unless this calibration is for pictures of this size [pixels]."""
@@ -61,12 +65,7 @@ class CameraModel:
 
     def project(self, points):
         """Pixels (N, 2) of points (N, 3) [m] in the camera's frame, which lie in front of it."""
-        points = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
-        zero = np.zeros(3)
-        return cv2.projectPoints(points, zero, zero, self.matrix, self._coefficients())[0][:, 0]
-
-    def _coefficients(self):
-        return self.distortion if len(self.distortion) else None
+        return projected(np.ascontiguousarray(points, float).reshape(-1, 3), *self.lens)
 
 
 def _check_matrix(matrix):
@@ -79,6 +78,22 @@ def _check_matrix(matrix):
         )
     if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise CameraError(f"camera matrix {matrix.tolist()}, expected the last row 0 0 1")
+
+
+def _lens(distortion):
+    """Twelve coefficients, and the projection (3, 3) of a sensor tilted by the other two."""
+    padded = np.zeros(14)
+    padded[: len(distortion)] = distortion
+    (sine_x, sine_y), (cosine_x, cosine_y) = np.sin(padded[12:]), np.cos(padded[12:])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cosine_x, sine_x], [0.0, -sine_x, cosine_x]])
+    about_y = np.array([[cosine_y, 0.0, -sine_y], [0.0, 1.0, 0.0], [sine_y, 0.0, cosine_y]])
+    turn = about_y @ about_x
+    onto = np.eye(3)
+    onto[0, 0] = onto[1, 1] = turn[2, 2]
+    onto[:2, 2] = -turn[:2, 2]
+    coefficients, tilt = padded[:12].copy(), onto @ turn
+    coefficients.flags.writeable = tilt.flags.writeable = False
+    return coefficients, tilt
 
 
 def guessed_camera(width, height):

@@ -40,7 +40,8 @@ def draw_tracking(picture, tracking, targets, camera, notes=()):
         if tracked.in_camera is not None:
             _axes(picture, tracked.in_camera, 0.5 * _extent(targets[tracked.name]), camera)
         _text(picture, line, _describe(tracked), _COLORS[tracked.status])
-    for line, note in enumerate((*tracking.problems, *notes), start=len(everything)):
+    notes = (*(problem.text for problem in tracking.problems), *notes)
+    for line, note in enumerate(notes, start=len(everything)):
         _text(picture, line, note, (80, 160, 255))
     return picture
 

@@ -7,21 +7,20 @@ Quaternion kinematics for the error-state Kalman filter). A hand rests, glides o
 process noise suits all three, so one filter for each runs and they are weighed by how well they
 foresaw the measurements (interacting multiple models, Blom & Bar-Shalom 1988).
 
-`predict` and `update` are pure functions; a FilterState is never changed.
+`predict` and `update` are pure functions; a FilterState is never changed. Their arithmetic is
+compiled, see `core.motion_filter`.
 """
 
-import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from sph_ros.tracking.se3 import Pose, exp, log
+from sph_ros.core.motion_filter import mean_of, predicted, surprise_of, updated
+from sph_ros.tracking.se3 import Pose
 
 POSITION, ROTATION, VELOCITY, SPIN = (slice(i, i + 3) for i in (0, 3, 6, 9))
-
-#: No kind of motion is ever ruled out [-].
-LEAST_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -129,66 +128,7 @@ def predict(state, elapsed, settings, glide=None):
     if elapsed <= 0.0:
         return state
     travel, left = (elapsed, 1.0) if glide is None else glide
-    state = _mixed(state, elapsed, settings)
-    moving = np.array([kind.acceleration is not None for kind in settings.kinds])
-    travels = np.where(moving, travel, 0.0)[:, None]
-    kept = np.where(moving, left, 0.0)[:, None]
-    turns = exp(state.spins * travels)
-    count = len(moving)
-    transition = np.tile(np.eye(12), (count, 1, 1))
-    transition[:, ROTATION, ROTATION] = turns
-    for m in range(count):
-        transition[m, POSITION, VELOCITY] = transition[m, ROTATION, SPIN] = travels[m] * np.eye(3)
-        transition[m, VELOCITY, VELOCITY] = transition[m, SPIN, SPIN] = kept[m] * np.eye(3)
-    noise = np.stack([process_noise(kind, elapsed, settings) for kind in settings.kinds])
-    covariances = transition @ state.covariances @ transition.transpose(0, 2, 1) + noise
-    return FilterState(
-        state.positions + state.velocities * travels,
-        turns @ state.rotations,
-        state.velocities * kept,
-        state.spins * kept,
-        covariances,
-        state.weights,
-    )
-
-
-def process_noise(kind, elapsed, settings):
-    """Covariance (12, 12) that a kind of motion adds in a time [s].
-
-    Moving: white acceleration of the density a^2 T, which a hand's acceleration a that lasts T
-    looks like over longer times (Bar-Shalom, Li & Kirubarajan 2001, eq. 6.2.2-12).
-    """
-    noise = np.zeros((12, 12))
-    if kind.acceleration is None:
-        sizes = (kind.drift**2 * elapsed, kind.angular_drift**2 * elapsed,
-                 settings.rest_speed**2, settings.rest_spin**2)  # fmt: skip
-        noise[np.diag_indices(12)] = np.repeat(sizes, 3)
-        return noise
-    pairs = (
-        (POSITION, VELOCITY, kind.acceleration),
-        (ROTATION, SPIN, kind.angular_acceleration),
-    )
-    for place, speed, acceleration in pairs:
-        density = acceleration**2 * settings.acceleration_time
-        noise[place, place] = density * elapsed**3 / 3.0 * np.eye(3)
-        noise[place, speed] = noise[speed, place] = density * elapsed**2 / 2.0 * np.eye(3)
-        noise[speed, speed] = density * elapsed * np.eye(3)
-    return noise
-
-
-def innovation(state, measurement):
-    """What was not foreseen: errors (M, 6), their covariances (M, 6, 6), squared distances (M,)."""
-    pose = measurement.pose
-    errors = np.concatenate(
-        [
-            pose.position - state.positions,
-            log(pose.rotation @ state.rotations.transpose(0, 2, 1)),
-        ],
-        axis=1,
-    )
-    spreads = state.covariances[:, :6, :6] + measurement.covariance
-    solved = np.linalg.solve(spreads, errors[:, :, None])[:, :, 0]
-    return errors, spreads, np.einsum("mi,mi->m", errors, solved)
+    return FilterState(*predicted(*state, *_tables(settings), elapsed, travel, left))
 
 
 def surprise(state, measurement):
@@ -196,89 +136,49 @@ def surprise(state, measurement):
 
     A kind that is not likely now has to be paid for: a thing at rest does not suddenly jerk.
     """
-    distances = innovation(state, measurement)[2]
-    return float(np.min(distances - 2.0 * np.log(state.weights)))
+    return surprise_of(
+        state.positions,
+        state.rotations,
+        state.covariances,
+        state.weights,
+        *_arrays(measurement),
+    )
 
 
 def update(state, measurement):
     """The state after a measurement of this moment."""
-    errors, spreads, distances = innovation(state, measurement)
-    across = state.covariances[:, :, :6]
-    gains = np.linalg.solve(spreads, across.transpose(0, 2, 1)).transpose(0, 2, 1)
-    steps = np.einsum("mij,mj->mi", gains, errors)
-    covariances = state.covariances - gains @ across.transpose(0, 2, 1)
-    covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-    likelihoods = -0.5 * (distances + np.linalg.slogdet(spreads)[1])
-    weights = state.weights * np.exp(likelihoods - likelihoods.max())
-    return FilterState(
-        state.positions + steps[:, POSITION],
-        exp(steps[:, ROTATION]) @ state.rotations,
-        state.velocities + steps[:, VELOCITY],
-        state.spins + steps[:, SPIN],
-        covariances,
-        _normalized(weights),
-    )
+    return FilterState(*updated(*state, *_arrays(measurement)))
 
 
 def mean(state):
     """The Estimate that a state amounts to."""
-    reference, errors = _errors(state)
-    shift = state.weights @ errors
-    return Estimate(
-        Pose(exp(shift[ROTATION]) @ reference.rotation, reference.position + shift[POSITION]),
-        state.weights @ state.velocities,
-        state.weights @ state.spins,
-        _moment(state.covariances, errors - shift, state.weights),
-        state.weights,
+    rotation, position, velocity, spin, covariance = mean_of(*state)
+    return Estimate(Pose(rotation, position), velocity, spin, covariance, state.weights)
+
+
+def _arrays(measurement):
+    """Rotation, position and covariance of a measurement as kernels take them."""
+    pose, covariance = measurement
+    return tuple(np.ascontiguousarray(a) for a in (pose.rotation, pose.position, covariance))
+
+
+@lru_cache(maxsize=16)
+def _tables(settings):
+    """Tables of kinds (M, 5) and of times and speeds (4,), see `core.motion_filter`."""
+    kinds = [
+        (
+            kind.acceleration is not None,
+            kind.acceleration or 0.0,
+            kind.angular_acceleration,
+            kind.drift,
+            kind.angular_drift,
+        )
+        for kind in settings.kinds
+    ]
+    rates = (
+        settings.acceleration_time,
+        settings.kind_time,
+        settings.rest_speed,
+        settings.rest_spin,
     )
-
-
-def _mixed(state, elapsed, settings):
-    """The states that the kinds begin with, each a mixture of what may have become it."""
-    count = len(state.weights)
-    stay = math.exp(-elapsed / settings.kind_time)
-    chances = stay * np.eye(count) + (1.0 - stay) / count  # from row to column
-    joint = chances * state.weights[:, None]
-    weights = joint.sum(axis=0)
-    shares = (joint / weights).T  # (to, from)
-    reference, errors = _errors(state)
-    shifts = shares @ errors
-    spreads = errors[None] - shifts[:, None]  # (to, from, 12)
-    covariances = np.einsum("tf,fij->tij", shares, state.covariances)
-    covariances += np.einsum("tf,tfi,tfj->tij", shares, spreads, spreads)
-    return FilterState(
-        reference.position + shifts[:, POSITION],
-        exp(shifts[:, ROTATION]) @ reference.rotation,
-        shares @ state.velocities,
-        shares @ state.spins,
-        covariances,
-        _normalized(weights),
-    )
-
-
-def _errors(state):
-    """The likeliest pose, and the errors (M, 12) of all states about it; velocities about zero."""
-    best = int(np.argmax(state.weights))
-    reference = Pose(state.rotations[best], state.positions[best])
-    errors = np.concatenate(
-        [
-            state.positions - reference.position,
-            log(state.rotations @ reference.rotation.T),
-            state.velocities,
-            state.spins,
-        ],
-        axis=1,
-    )
-    return reference, errors
-
-
-def _moment(covariances, errors, weights):
-    """Covariance (12, 12) of a mixture."""
-    return np.einsum("m,mij->ij", weights, covariances) + np.einsum(
-        "m,mi,mj->ij", weights, errors, errors
-    )
-
-
-def _normalized(weights):
-    weights = np.maximum(weights / weights.sum(), LEAST_WEIGHT)
-    return weights / weights.sum()
+    return np.array(kinds, float), np.array(rates, float)

@@ -6,12 +6,14 @@ IPPE gives both (Collins & Bartoli 2014, Infinitesimal Plane-Based Pose Estimati
 to the least reprojection error (Levenberg-Marquardt), and none is dropped here.
 """
 
+import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from sph_ros.tracking.se3 import Pose, difference, exp, hat
+from sph_ros.core.pinhole import best_pose, covariance_of, most_probable_pose
+from sph_ros.tracking.se3 import Pose, exp
 
 #: Two solutions that differ less are one: [m] per metre of distance, and [rad].
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
@@ -19,16 +21,14 @@ SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
 #: Relative thickness below which a set of points is a plane.
 PLANAR = 1e-4
 
-
-#: Least share of a well-known direction's information that any direction gets.
-UNKNOWN = 1e-8
-
-
 #: Steps of Gauss and Newton towards the most probable pose.
 RELINEARIZATIONS = 2
 
 #: More squared error over variance [-] than the best fit has, and the prediction is not believed.
 MISFIT = 30.0
+
+#: Residuals so many times larger than the corner noise are taken for noisier corners.
+TOLERATED = 2.0
 
 
 class Solution(NamedTuple):
@@ -47,6 +47,33 @@ class Solution(NamedTuple):
     residual: float
 
 
+class Sighting(NamedTuple):
+    """What one picture shows of a target.
+
+    Attributes:
+        points: corners in the target's frame, (N, 3) [m].
+        pixels: the same in the picture, (N, 2).
+        camera: CameraModel.
+        corner_noise: standard deviation of a corner along x and y [pixels].
+    """
+
+    points: np.ndarray
+    pixels: np.ndarray
+    camera: object
+    corner_noise: float
+
+    def variance(self, chi_squared):
+        """Of a corner: blur or a bad calibration show in the best fit, and make it larger."""
+        freedom = max(self.pixels.size - 6, 1)
+        return self.corner_noise**2 * max(1.0, chi_squared / freedom / TOLERATED**2)
+
+
+def sighting_of(target, detections, camera, corner_noise):
+    """The Sighting of a target; `detections` are of its markers, each id once."""
+    pixels = np.concatenate([detection.corners for detection in detections])
+    return Sighting(target.points([d.id for d in detections]), pixels, camera, corner_noise)
+
+
 def estimate_poses(target, detections, camera, corner_noise):
     """All poses of a target that fit, best first; none when OpenCV finds none.
 
@@ -56,101 +83,65 @@ def estimate_poses(target, detections, camera, corner_noise):
         camera: a CameraModel.
         corner_noise: standard deviation of a corner along x and y [pixels].
     """
-    points = np.ascontiguousarray(target.points([d.id for d in detections]))
-    pixels = np.ascontiguousarray(np.concatenate([d.corners for d in detections]))
-    starts = _starts(target, detections, camera, points, pixels)
+    sighting = sighting_of(target, detections, camera, corner_noise)
     solutions = []
-    for start in starts:
-        pose = _refined(start, points, pixels, camera)
-        if pose is None or any(_same(pose, other.pose) for other in solutions):
-            continue
-        solutions.append(_solution(pose, points, pixels, camera, corner_noise))
+    for start in _starts(target, detections, sighting):
+        solution = _solution(start, sighting)
+        if solution and not any(_same(solution.pose, other.pose) for other in solutions):
+            solutions.append(solution)
     return sorted(solutions, key=lambda solution: solution.chi_squared)[:2]
 
 
-def _starts(target, detections, camera, points, pixels):
+def _starts(target, detections, sighting):
     """Poses to refine: both of IPPE for a plane, else those of the largest markers."""
+    camera = sighting.camera
     if len(detections) == 1:
         return _marker_starts(target, detections[0], camera)
-    if _is_planar(points):
-        return _ippe(points, pixels, camera, cv2.SOLVEPNP_IPPE)
+    if _is_planar(sighting.points):
+        return _ippe(sighting.points, sighting.pixels, camera, cv2.SOLVEPNP_IPPE)
     areas = [cv2.contourArea(d.corners.astype(np.float32)) for d in detections]
-    largest = sorted(zip(areas, range(len(areas)), strict=True), reverse=True)[:2]
     starts = []
-    for _, index in largest:
+    for index in np.argsort(areas)[:-3:-1]:
         starts += _marker_starts(target, detections[index], camera)
-    errors = [np.sum((_project(s, points, camera)[0] - pixels) ** 2) for s in starts]
+    errors = [np.sum((camera.project(s.apply(sighting.points)) - sighting.pixels) ** 2)
+              for s in starts]  # fmt: skip
     return [starts[i] for i in np.argsort(errors)[:3]]
 
 
 def _marker_starts(target, detection, camera):
-    size = target.marker_size(detection.id)
-    square = 0.5 * size * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
-    pixels = np.ascontiguousarray(detection.corners)
+    square = target.square(detection.id)
+    poses = _ippe(square, detection.corners, camera, cv2.SOLVEPNP_IPPE_SQUARE)
     marker_from_target = target.marker_pose(detection.id).inverse()
-    poses = _ippe(square, pixels, camera, cv2.SOLVEPNP_IPPE_SQUARE)
     return [camera_from_marker @ marker_from_target for camera_from_marker in poses]
 
 
 def _ippe(points, pixels, camera, method):
     try:
         _, turns, shifts, _ = cv2.solvePnPGeneric(
-            points, pixels, camera.matrix, camera.distortion, flags=method
+            points, np.ascontiguousarray(pixels), camera.matrix, camera.distortion, flags=method
         )
     except cv2.error:  # corners on a line
         return []
-    poses = [
+    return [
         Pose(cv2.Rodrigues(turn)[0], shift.ravel())
         for turn, shift in zip(turns, shifts, strict=True)
     ]
-    return [p for p in poses if np.isfinite(p.position).all() and np.isfinite(p.rotation).all()]
 
 
-def _refined(pose, points, pixels, camera):
-    """The pose of least reprojection error near `pose`; None where it is not before the camera."""
-    turn = cv2.Rodrigues(pose.rotation)[0]
-    shift = np.array(pose.position).reshape(3, 1)
-    try:
-        turn, shift = cv2.solvePnPRefineLM(
-            points, pixels, camera.matrix, camera.distortion, turn, shift
-        )
-    except cv2.error:
+def _solution(start, sighting):
+    """The Solution near a pose; None where there is none before the camera."""
+    rotation, position, squares, information = best_pose(
+        start.rotation, start.position, sighting.points, sighting.pixels, *sighting.camera.lens
+    )
+    if not math.isfinite(squares):
         return None
-    refined = Pose(cv2.Rodrigues(turn)[0], shift.ravel())
-    depths = refined.apply(points)[:, 2]
-    good = np.isfinite(refined.rotation).all() and np.isfinite(depths).all() and depths.min() > 0.0
-    return refined if good else None
+    chi_squared = squares / sighting.corner_noise**2
+    covariance = covariance_of(information, sighting.variance(chi_squared))
+    residual = math.sqrt(squares / len(sighting.pixels))
+    return Solution(Pose(rotation, position), chi_squared, covariance, residual)
 
 
-def _project(pose, points, camera):
-    """Pixels (N, 2) and their derivatives (2 N, 6) by an error of the pose, see `se3`."""
-    in_camera = np.ascontiguousarray(pose.apply(points))
-    zero = np.zeros(3)
-    pixels, jacobian = cv2.projectPoints(in_camera, zero, zero, camera.matrix, camera.distortion)
-    by_shift = jacobian[:, 3:6]
-    # exp(error) turns R X alone, so d(point)/d(turn) = -hat(R X); the chain goes through the point.
-    turned = in_camera - pose.position
-    by_turn = -np.einsum("nij,njk->nik", by_shift.reshape(-1, 2, 3), hat(turned)).reshape(-1, 3)
-    return pixels[:, 0], np.hstack([by_shift, by_turn])
-
-
-def _solution(pose, points, pixels, camera, corner_noise):
-    projected, jacobian = _project(pose, points, camera)
-    squares = float(np.sum((projected - pixels) ** 2))
-    chi_squared = squares / corner_noise**2
-    # Blur or a bad calibration show in the residual: then the corners are noisier than assumed.
-    freedom = max(pixels.size - 6, 1)
-    variance = corner_noise**2 * max(1.0, chi_squared / freedom / 4.0)
-    # Columns scaled to length one, for pixels per metre and per radian differ by orders; a trace of
-    # prior knowledge keeps the inverse finite where an edge-on marker leaves a direction unknown.
-    scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-6)
-    scaled = jacobian * scale
-    inverse = np.linalg.inv(scaled.T @ scaled + UNKNOWN * np.eye(6))
-    covariance = variance * inverse * np.outer(scale, scale)
-    return Solution(pose, chi_squared, covariance, float(np.sqrt(squares / len(pixels))))
-
-
-def relinearized(solution, prior, target, detections, camera, corner_noise):
+def relinearized(solution, prior, sighting):
     """The same corners as a measurement linear about what they and the prediction amount to.
 
     Seen face on, a marker's picture changes with the square of its tilt: about its own solution the
@@ -160,35 +151,27 @@ def relinearized(solution, prior, target, detections, camera, corner_noise):
     Args:
         solution: a Solution that the corners alone gave.
         prior: predicted camera_from_target and its covariance (6, 6), as a pair.
-        target, detections, camera, corner_noise: as in `estimate_poses`.
+        sighting: Sighting of the corners.
 
     Returns:
         (camera_from_target, covariance (6, 6)): those of `solution` where the prediction does not
         fit the corners.
     """
-    points = np.ascontiguousarray(target.points([d.id for d in detections]))
-    pixels = np.concatenate([d.corners for d in detections])
-    variance = corner_noise**2 * max(1.0, solution.chi_squared / max(pixels.size - 6, 1) / 4.0)
-    precision = np.linalg.inv(prior[1])
-    pose = prior[0]
-    for iteration in range(RELINEARIZATIONS + 1):
-        projected, jacobian = _project(pose, points, camera)
-        errors = (pixels - projected).ravel()
-        information = jacobian.T @ jacobian / variance
-        pull = jacobian.T @ errors / variance
-        if iteration < RELINEARIZATIONS:
-            back = difference(prior[0], pose)
-            pose = perturbed(
-                pose, np.linalg.solve(information + precision, pull + precision @ back)
-            )
-            if not pose.apply(points)[:, 2].min() > 0.0:
-                return solution.pose, solution.covariance
-    if float(errors @ errors) > variance * (
-        solution.chi_squared * corner_noise**2 / variance + MISFIT
-    ):
+    pose, spread = prior
+    variance = sighting.variance(solution.chi_squared)
+    rotation, position, covariance, squares = most_probable_pose(
+        np.ascontiguousarray(pose.rotation),
+        np.ascontiguousarray(pose.position),
+        np.ascontiguousarray(spread),
+        sighting.points,
+        sighting.pixels,
+        variance,
+        RELINEARIZATIONS,
+        *sighting.camera.lens,
+    )
+    if not squares <= solution.chi_squared * sighting.corner_noise**2 + MISFIT * variance:
         return solution.pose, solution.covariance
-    covariance = np.linalg.inv(information + UNKNOWN * np.diag(np.diag(information)))
-    return perturbed(pose, covariance @ pull), covariance
+    return Pose(rotation, position), covariance
 
 
 def _is_planar(points):
@@ -197,10 +180,10 @@ def _is_planar(points):
 
 
 def _same(a, b):
-    if np.linalg.norm(a.position - b.position) > SAME_POSITION * np.linalg.norm(b.position):
+    if math.dist(a.position, b.position) > SAME_POSITION * math.hypot(*b.position):
         return False
-    # trace = 1 + 2 cos(angle)
-    return np.trace(a.rotation @ b.rotation.T) > 1.0 + 2.0 * np.cos(SAME_ANGLE)
+    # The trace of A B^T, 1 + 2 cos(angle).
+    return np.vdot(a.rotation, b.rotation) > 1.0 + 2.0 * math.cos(SAME_ANGLE)
 
 
 def perturbed(pose, error):

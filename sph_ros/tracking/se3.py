@@ -10,7 +10,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from sph_ros.core.motion_filter import (
+    covariance_of_inverse,
+    covariance_of_product,
+    quaternion_of,
+    rotations_from_vectors,
+    vectors_from_rotations,
+)
+from sph_ros.sim import quaternions
 
 
 class Pose(NamedTuple):
@@ -25,7 +33,7 @@ class Pose(NamedTuple):
 
     def inverse(self):
         """b_from_a of a_from_b."""
-        back = self.rotation.T
+        back = np.ascontiguousarray(self.rotation.T)
         return Pose(back, -back @ self.position)
 
     def apply(self, points):
@@ -35,7 +43,7 @@ class Pose(NamedTuple):
     @property
     def quat_xyzw(self):
         """Unit quaternion (4,) with w >= 0."""
-        return Rotation.from_matrix(self.rotation).as_quat(canonical=True)
+        return quaternion_of(np.ascontiguousarray(self.rotation))
 
 
 IDENTITY = Pose(np.eye(3), np.zeros(3))
@@ -43,7 +51,7 @@ IDENTITY = Pose(np.eye(3), np.zeros(3))
 
 def pose_from_quaternion(position, quat_xyzw):
     """A Pose from position (3,) [m] and a quaternion of any length but zero."""
-    rotation = Rotation.from_quat(np.asarray(quat_xyzw, float)).as_matrix()
+    rotation = quaternions.to_matrix(quaternions.normalized(quat_xyzw))
     return Pose(rotation, np.asarray(position, float))
 
 
@@ -62,14 +70,16 @@ def exp(vectors):
     vectors = np.asarray(vectors, float)
     if vectors.ndim == 1:
         return cv2.Rodrigues(vectors)[0]
-    return np.array([cv2.Rodrigues(vector)[0] for vector in vectors])
+    flat = np.ascontiguousarray(vectors.reshape(-1, 3))
+    return rotations_from_vectors(flat).reshape(*vectors.shape, 3)
 
 
 def log(rotations):
     """Rotation vectors (..., 3) [rad], at most pi long, of matrices (..., 3, 3)."""
     if rotations.ndim == 2:
         return cv2.Rodrigues(rotations)[0][:, 0]
-    return np.array([cv2.Rodrigues(rotation)[0][:, 0] for rotation in rotations])
+    flat = np.ascontiguousarray(rotations.reshape(-1, 3, 3))
+    return vectors_from_rotations(flat).reshape(rotations.shape[:-1])
 
 
 def difference(pose, reference):
@@ -80,17 +90,19 @@ def difference(pose, reference):
 
 def composed_covariance(a_from_b, covariance_ab, b_from_c, covariance_bc):
     """Covariance (6, 6) of a_from_b @ b_from_c from those of both, taken as independent."""
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = turned[3:, 3:] = a_from_b.rotation
-    lever = np.eye(6)
-    lever[:3, 3:] = -hat(a_from_b.rotation @ b_from_c.position)
-    return lever @ covariance_ab @ lever.T + turned @ covariance_bc @ turned.T
+    arm = a_from_b.rotation @ b_from_c.position
+    return covariance_of_product(
+        np.ascontiguousarray(a_from_b.rotation),
+        arm,
+        np.ascontiguousarray(covariance_ab),
+        np.ascontiguousarray(covariance_bc),
+    )
 
 
 def inverse_covariance(a_from_b, covariance):
     """Covariance (6, 6) of b_from_a, the inverse pose."""
-    back = a_from_b.rotation.T
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = -back
-    jacobian[:3, 3:] = -back @ hat(a_from_b.position)
-    return jacobian @ covariance @ jacobian.T
+    return covariance_of_inverse(
+        np.ascontiguousarray(a_from_b.rotation),
+        np.ascontiguousarray(a_from_b.position),
+        np.ascontiguousarray(covariance),
+    )

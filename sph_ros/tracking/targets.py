@@ -57,6 +57,10 @@ class Target:
     name: str
     corners: dict
 
+    def __post_init__(self):
+        # Worked out once: they are asked for in every picture.
+        object.__setattr__(self, "_poses", {i: _square_pose(c) for i, c in self.corners.items()})
+
     @property
     def ids(self):
         """Its markers' ids."""
@@ -68,17 +72,25 @@ class Target:
 
     def marker_pose(self, marker_id):
         """target_from_marker."""
-        corners = self.corners[marker_id]
-        x = corners[1] - corners[0]
-        x /= np.linalg.norm(x)
-        y = corners[0] - corners[3]
-        y /= np.linalg.norm(y)
-        return Pose(np.column_stack([x, y, np.cross(x, y)]), corners.mean(axis=0))
+        return self._poses[marker_id]
+
+    def square(self, marker_id):
+        """Corners (4, 3) [m] of a marker in its own frame."""
+        return self.marker_size(marker_id) * UNIT_CORNERS
 
     def marker_size(self, marker_id):
         """Side of a marker [m]."""
         corners = self.corners[marker_id]
-        return float(np.linalg.norm(corners[1] - corners[0]))
+        return math.dist(corners[1], corners[0])
+
+
+def _square_pose(corners):
+    """Pose of the square with corners (4, 3)."""
+    x = corners[1] - corners[0]
+    x /= np.linalg.norm(x)
+    y = corners[0] - corners[3]
+    y /= np.linalg.norm(y)
+    return Pose(np.column_stack([x, y, np.cross(x, y)]), corners.mean(axis=0))
 
 
 def single_marker(name, marker_id, size):

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sph_ros.tracking.ambiguity import ChoiceSettings, PoseChooser, Prediction
-from sph_ros.tracking.detection import Detector, merged_regions, region_around
+from sph_ros.tracking.detection import Detector
 from sph_ros.tracking.filter import Measurement
 from sph_ros.tracking.limits import Limiter, Limits
-from sph_ros.tracking.pose import estimate_poses, relinearized
+from sph_ros.tracking.pose import estimate_poses, relinearized, sighting_of
 from sph_ros.tracking.se3 import IDENTITY, Pose, composed_covariance, inverse_covariance
+from sph_ros.tracking.search import RECENTLY, Expected, Search
 from sph_ros.tracking.targets import Target, check_targets
 from sph_ros.tracking.tracks import TrackSettings, make_track
 
@@ -26,8 +27,8 @@ RESTART_COUNT = 3
 #: Pauses between pictures longer than this [s] say nothing about their rate.
 LONGEST_INTERVAL = 0.2
 
-#: A target that was lost so recently [s] is looked for in every picture.
-RECENTLY = 0.5
+#: Markers nearer than this to the camera's plane [m] have no place in the picture.
+NEAR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class TrackerSettings:
         corner_noise: standard deviation of a corner along x and y [pixels].
         world_hold: so long after the world marker was last seen the camera is taken as still [s].
         search_interval: the whole picture is searched for missing targets so often [s].
-        full_interval: the whole picture is searched at least so often [s]; 0 for every picture.
+        full_interval: it is searched thoroughly so often [s]; 0 for every picture.
     """
 
     solids: tuple = ()
@@ -88,6 +89,13 @@ class Tracked(NamedTuple):
     motion: np.ndarray
 
 
+class Problem(NamedTuple):
+    """Something is wrong with what is seen: `world` or `marker twice`, and a text for people."""
+
+    kind: str
+    text: str
+
+
 class Tracking(NamedTuple):
     """All about one picture.
 
@@ -96,7 +104,7 @@ class Tracking(NamedTuple):
         solids: name -> Tracked.
         detections: what was found.
         regions: where; None for the whole picture.
-        problems: what is wrong, for people.
+        problems: Problems.
     """
 
     world: Tracked | None
@@ -121,7 +129,8 @@ class Tracker:
         self._targets = (*settings.solids, *((settings.world,) if settings.world else ()))
         check_targets(self._targets)
         ids = [i for target in self._targets for i in target.ids]
-        self._detector = Detector(settings.dictionary, ids)
+        detector = Detector(settings.dictionary, ids)
+        self._search = Search(detector, settings.search_interval, settings.full_interval)
         self.reset()
 
     def reset(self):
@@ -129,7 +138,7 @@ class Tracker:
         self._time = self._first_stamp = None
         self._stragglers = 0
         self._interval = 1.0 / 30.0  # between pictures [s]
-        self._last_full = self._last_search = -math.inf
+        self._search.reset()
         self._followed = {
             t.name: _Followed(t, self.settings, bounded=t is not self.settings.world)
             for t in self._targets
@@ -153,9 +162,9 @@ class Tracker:
         camera.check_size(gray.shape[1], gray.shape[0])
         if not self._advance(stamp_ns):
             return None
-        regions = self._regions(gray.shape, camera)
-        detections = self._detector.detect(gray, regions)
-        return self.track(detections, camera, self._time, lookahead)._replace(regions=regions)
+        found = self._search.find(gray, self._expected(camera), self._time, self._interval)
+        tracking = self.track(found.detections, camera, self._time, lookahead)
+        return tracking._replace(regions=found.regions)
 
     def track(self, detections, camera, time, lookahead=0.0):
         """The same from detections; times [s] must increase."""
@@ -170,7 +179,7 @@ class Tracker:
             followed.observe_in(base, by_id, camera, time)
             solids[target.name] = followed.tracked(base, time, lookahead)
         if world is not None and base is None:
-            problems.append(self._world_problem(world))
+            problems.append(Problem("world", self._world_text(world)))
         return Tracking(world, solids, detections, None, problems)
 
     def _advance(self, stamp_ns):
@@ -189,33 +198,19 @@ class Tracker:
         self._time, self._stragglers = time, 0
         return True
 
-    # ---------------------------------------------------------------- where to look
-
-    def _regions(self, shape, camera):
-        """Regions of interest; None when the whole picture is to be searched."""
-        settings, time = self.settings, self._time
-        ages = [followed.track.age(time) for followed in self._followed.values()]
-        missing = [age for age in ages if age > 1.5 * self._interval]
-        urgent = any(age < RECENTLY for age in missing)
-        due = time - self._last_search >= settings.search_interval - 0.5 * self._interval
-        full = time - self._last_full >= settings.full_interval or urgent or (missing and due)
-        regions = [] if full else self._predicted_regions(shape, camera)
-        if full or not regions:
-            self._last_full = self._last_search = time
-            return None
-        return merged_regions(regions)
-
-    def _predicted_regions(self, shape, camera):
+    def _expected(self, camera):
+        """Where the corners of each target should be in this picture."""
         base = self._camera_from_world(self._time)
-        regions = []
+        expected = []
         for followed in self._followed.values():
-            prediction = followed.prediction(base, self._time)
-            if prediction is None or followed.track.age(self._time) > RECENTLY:
-                continue
-            points = prediction.pose.apply(followed.target.points(followed.target.ids))
-            if points[:, 2].min() > 0.01:
-                regions.append(region_around(camera.project(points), shape))
-        return [r for r in regions if r[2] - r[0] > 8 and r[3] - r[1] > 8]
+            target, pixels = followed.target, None
+            age = followed.track.age(self._time)
+            prediction = followed.prediction(base, self._time) if age < RECENTLY else None
+            if prediction is not None:
+                points = prediction.pose.apply(target.points(target.ids))
+                pixels = camera.project(points) if points[:, 2].min() > NEAR else None
+            expected.append(Expected(target.ids, pixels, age))
+        return expected
 
     # ---------------------------------------------------------------- what was found
 
@@ -228,7 +223,8 @@ class Tracker:
             kept = self._nearest(marker_id, same, camera, time)
             detections = [d for d in detections if d.id != marker_id or d is kept]
             what = "none is used" if kept is None else "the nearest to where it was is used"
-            problems.append(f"marker {marker_id} was seen {len(same)} times: {what}")
+            text = f"marker {marker_id} was seen {len(same)} times: {what}"
+            problems.append(Problem("marker twice", text))
         return detections, problems
 
     def _nearest(self, marker_id, detections, camera, time):
@@ -237,7 +233,7 @@ class Tracker:
         if prediction is None or followed.track.age(time) > self.settings.track.lost_time:
             return None
         points = prediction.pose.apply(followed.target.corners[marker_id])
-        if points[:, 2].min() <= 0.01:
+        if points[:, 2].min() <= NEAR:
             return None
         pixels = camera.project(points)
         return min(detections, key=lambda d: float(np.abs(d.corners - pixels).max()))
@@ -261,7 +257,7 @@ class Tracker:
             return None
         return track.at(time).pose, held_covariance(track, time)
 
-    def _world_problem(self, world):
+    def _world_text(self, world):
         ids = ", ".join(map(str, self.settings.world.ids[:5]))
         if world.age == math.inf:
             return f"the world marker (id {ids}) was never seen, so no pose can be given"
@@ -313,10 +309,8 @@ class _Followed:
         choice = self._chooser.choose(solutions, prediction)
         measured = choice.solution.pose, choice.solution.covariance
         if self._relinearize and prediction is not None and not choice.flipped:
-            noise = self._settings.corner_noise
-            measured = relinearized(
-                choice.solution, prediction, self.target, detections, camera, noise
-            )
+            sighting = sighting_of(self.target, detections, camera, self._settings.corner_noise)
+            measured = relinearized(choice.solution, prediction, sighting)
         measurement = _in_reference(base, *measured)
         (self.track.restart if choice.flipped else self.track.observe)(time, measurement)
 

@@ -21,6 +21,9 @@ from sph_ros.tracking.filter import (
 )
 from sph_ros.tracking.se3 import Pose, difference, exp, log
 
+#: A track is asked for so few moments of each picture that no more are remembered.
+KEPT = 8
+
 FILTERS = ("kalman", "one_euro", "none")
 
 
@@ -191,6 +194,7 @@ class KalmanTrack(Track):
         if self._state is None:
             return None
         if time not in self._means:
+            _make_room(self._means)
             self._means[time] = mean(self._predicted(time))
         return self._means[time]
 
@@ -208,6 +212,7 @@ class KalmanTrack(Track):
     def _predicted(self, time):
         """The state at a time, always from the last measurement: gaps do not add up roundings."""
         if time not in self._predictions:
+            _make_room(self._predictions)
             self._predictions[time] = self._predict_from(self._state, time - self.seen)
         return self._predictions[time]
 
@@ -261,6 +266,12 @@ class KalmanTrack(Track):
             and float(np.linalg.norm(error[:3])) <= shift
             and float(np.linalg.norm(error[3:])) <= turn
         )
+
+
+def _make_room(kept):
+    """Forget all when much is kept: a target may stay out of sight for hours."""
+    if len(kept) >= KEPT:
+        kept.clear()
 
 
 def smoothing_share(cutoff, elapsed):
