@@ -52,7 +52,10 @@ class Source:
 
     Attributes:
         problem: why no pictures come, "" while they do.
+        brings_camera: whether a calibration comes with the pictures.
     """
+
+    brings_camera = False
 
     def __init__(self, put, name):
         self.name = name
@@ -88,30 +91,26 @@ class DeviceSource(Source):
     Args:
         put: see Source.
         device: number or path.
-        open_capture: makes a cv2.VideoCapture, or what looks like one.
-        retry_time: see RETRY_TIME [s].
     """
 
-    def __init__(self, put, device, open_capture=cv2.VideoCapture, retry_time=RETRY_TIME):
+    def __init__(self, put, device):
         super().__init__(put, f"camera {device}")
         self._device = device
-        self._open_capture = open_capture
-        self._retry_time = retry_time
 
     def _deliver(self):
         while not self._stopped.is_set():
-            capture = self._open_capture(self._device)
+            capture = cv2.VideoCapture(self._device)
             try:
                 if capture.isOpened():
                     self._read(capture)
                 else:
                     self.problem = (
                         f"{self.name} cannot be opened (no such device, in use, or no permission), "
-                        f"trying again every {self._retry_time:g} s"
+                        f"trying again every {RETRY_TIME:g} s"
                     )
             finally:
                 capture.release()
-            self._stopped.wait(self._retry_time)
+            self._stopped.wait(RETRY_TIME)
 
     def _read(self, capture):
         while not self._stopped.is_set():
@@ -119,7 +118,7 @@ class DeviceSource(Source):
             if not good:
                 self.problem = (
                     f"{self.name} gives no more pictures (unplugged?), "
-                    f"trying again every {self._retry_time:g} s"
+                    f"trying again every {RETRY_TIME:g} s"
                 )
                 return
             self.problem = ""
@@ -213,6 +212,7 @@ class BagSource(Source):
         # camera_info lies beside the pictures; of several only that one is theirs.
         parent = chosen.name.rsplit("/", 2 if chosen.type == COMPRESSED_IMAGE else 1)[0]
         beside = [name for name in cameras if name.rsplit("/", 1)[0] == parent]
+        self.brings_camera = bool(cameras)
         return [chosen.name, *(beside or cameras)[:1]]
 
     def _deliver(self):

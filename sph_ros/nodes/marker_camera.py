@@ -2,10 +2,12 @@
 """Which calibration holds now: a file's, the newest camera_info's, or a stated guess."""
 
 import time
+from typing import NamedTuple
 
 from sph_ros.tracking.camera import (
     GUESSED_FIELD_OF_VIEW,
     CameraError,
+    CameraModel,
     guessed_camera,
     load_camera,
 )
@@ -22,6 +24,14 @@ class WaitingError(ValueError):
     """There is no calibration yet, but one may come at any moment."""
 
 
+class _Known(NamedTuple):
+    """What is known: a camera, or why there is none; nothing at first."""
+
+    camera: CameraModel | None = None
+    error: CameraError | None = None
+    uncalibrated: bool = False
+
+
 class CalibrationChoice:
     """Finds the camera model for a picture.
 
@@ -35,12 +45,10 @@ class CalibrationChoice:
         self._url = url
         self._rectified = rectified
         self._expect_messages = expect_messages
-        self._camera = None
-        self._error = None
+        self._known = _Known()
         self._body = None
         self._first_picture = None
         self._next_reading = 0.0
-        self._uncalibrated = False
 
     def hear(self, buffer):
         """Take a camera_info message in CDR bytes; a file has precedence."""
@@ -48,14 +56,12 @@ class CalibrationChoice:
         if self._url or body == self._body:
             return
         self._body = body
-        self._camera = self._error = None
-        self._uncalibrated = False
         try:
-            self._camera = cdr_to_camera(buffer, self._rectified)
+            self._known = _Known(camera=cdr_to_camera(buffer, self._rectified))
         except UncalibratedError:
-            self._uncalibrated = True
+            self._known = _Known(uncalibrated=True)
         except ValueError as error:
-            self._error = CameraError(f"camera_info cannot be used: {error}")
+            self._known = _Known(error=CameraError(f"camera_info cannot be used: {error}"))
 
     def for_picture(self, width, height):
         """The CameraModel for a picture of this size.
@@ -66,18 +72,21 @@ class CalibrationChoice:
         """
         if self._url:
             self._read_file()
-        if self._error is not None:
-            raise self._error
-        if self._camera is None:
+        known = self._known  # a bag's thread may set another one meanwhile
+        if known.error is not None:
+            raise known.error
+        if known.camera is None:
             return self._guess(width, height)
-        self._camera.check_size(width, height)
-        return self._camera
+        known.camera.check_size(width, height)
+        return known.camera
 
     def note(self, camera):
         """What people should know about a camera; "" when nothing."""
         if not camera.approximate:
             return ""
-        reason = "camera_info has K of zeros" if self._uncalibrated else "there is no calibration"
+        reason = (
+            "camera_info has K of zeros" if self._known.uncalibrated else "there is no calibration"
+        )
         return (
             f"{reason}: a field of view of {GUESSED_FIELD_OF_VIEW:g} degrees is assumed, so the "
             "scale is approximate; `sph_ros calibrate` makes one"
@@ -86,18 +95,17 @@ class CalibrationChoice:
     def _guess(self, width, height):
         now = time.monotonic()
         self._first_picture = now if self._first_picture is None else self._first_picture
-        waiting = self._expect_messages and not self._uncalibrated
+        waiting = self._expect_messages and not self._known.uncalibrated
         if waiting and now - self._first_picture < PATIENCE:
             raise WaitingError("waiting for camera_info")
         return guessed_camera(width, height)
 
     def _read_file(self):
         now = time.monotonic()
-        if self._camera is not None or now < self._next_reading:
+        if self._known.camera is not None or now < self._next_reading:
             return
         self._next_reading = now + RETRY_TIME
-        self._error = None
         try:
-            self._camera = load_camera(self._url, self._rectified)
+            self._known = _Known(camera=load_camera(self._url, self._rectified))
         except CameraError as error:
-            self._error = error
+            self._known = _Known(error=error)

@@ -11,20 +11,28 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 #: A problem is reported for so long after it last occurred [s].
 PROBLEM_TIME = 2.0
 
+#: One that goes on is said again so often [s].
+WARNING_PERIOD = 5.0
+
 
 class Problems:
     """What went wrong lately, from any thread."""
 
     def __init__(self):
         self.counts = Counter()
-        self._last = {}
+        self._last, self._said = {}, {}
         self._lock = threading.Lock()
 
     def note(self, kind, text):
-        """Keep a problem; the newest text of each kind counts."""
+        """Keep a problem, of each kind the newest text; returns whether it should be said now."""
+        now = time.monotonic()
         with self._lock:
             self.counts[kind] += 1
-            self._last[kind] = (time.monotonic(), text)
+            self._last[kind] = (now, text)
+            due = now - self._said.get(kind, -math.inf) >= WARNING_PERIOD
+            if due:
+                self._said[kind] = now
+        return due
 
     def recent(self):
         """Texts of problems that are not over, by kind."""

@@ -55,6 +55,14 @@ _OTHER_NUMBERS = {
 }  # fmt: skip
 
 
+# Parameters that change while the tracker runs, and need another one.
+_OF_TRACKER = {
+    *("filter", "marker_size", "corner_noise", "world_hold", "full_interval"),
+    *_TRACK_NUMBERS,
+    *_LIMIT_NUMBERS,
+}
+
+
 class TrackerParameterError(ValueError):
     """A parameter cannot be used; one line that says why."""
 
@@ -101,9 +109,14 @@ class MarkerParameters:
         return str(self["source"])
 
     def follow(self, apply):
-        """From now on check every change, and call `apply()` after each that was accepted."""
+        """From now on check every change, and call `apply()` after those that `settings` has."""
+
+        def changed(parameters):
+            if any(parameter.name in _OF_TRACKER for parameter in parameters):
+                apply()
+
         self._node.add_on_set_parameters_callback(self._check)
-        self._node.add_post_set_parameters_callback(lambda _parameters: apply())
+        self._node.add_post_set_parameters_callback(changed)
 
     def solid_names(self):
         """Names of the solids, whose topics exist whatever the marker size is."""

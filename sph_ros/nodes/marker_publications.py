@@ -41,6 +41,8 @@ class MarkerPublications:
         self._broadcaster = None
         if with_tf and tf2_ros is not None:
             self._broadcaster = tf2_ros.TransformBroadcaster(node)
+        elif with_tf:
+            node.get_logger().info("tf2_ros is not installed: poses go to topics, not to /tf")
 
     def listeners(self):
         """Number of subscriptions to anything."""

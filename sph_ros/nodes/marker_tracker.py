@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """``marker_tracker``: pictures of printed markers in, poses of solids out.
 
-Callbacks and sources only leave a picture in a mailbox that holds one; a thread of its own fetches
-it, so that no picture ever waits behind another. While nobody listens no picture is subscribed to
-and no camera is open.
+A thread of its own fetches the newest picture from a topic or from the mailbox of a source, so that
+no picture ever waits behind another. While nobody listens no picture is subscribed to and no camera
+is open.
 """
 
 import sys
 import threading
 import time
+import traceback
+from pathlib import Path
 
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from msg_adapters.image import COMPRESSED_IMAGE, IMAGE, cdr_to_compressed_image, cdr_to_image
+from msg_adapters.image import COMPRESSED_IMAGE, cdr_to_compressed_image, cdr_to_image
 from sph_ros.nodes.image_source import Encoded, Picture, SourceError, make_source
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status, target_status
+from sph_ros.nodes.marker_input import TopicInput
 from sph_ros.nodes.marker_mailbox import Mailbox
 from sph_ros.nodes.marker_parameters import MEASURED, MarkerParameters, TrackerParameterError
 from sph_ros.nodes.marker_publications import MarkerPublications
@@ -31,11 +31,10 @@ from sph_ros.tracking.camera_message import CAMERA_INFO
 from sph_ros.tracking.detection import DictionaryError
 from sph_ros.tracking.drawing import draw_notes, draw_tracking
 from sph_ros.tracking.images import ImageError, decode, to_bgr, to_gray
+from sph_ros.tracking.preparation import prepare
 from sph_ros.tracking.targets import TargetError
 from sph_ros.tracking.tracker import Tracker
-
-#: Warnings of one kind are at least so far apart [s].
-WARNING_PERIOD = 5.0
+from sph_ros.waiting import tell_while_waiting
 
 #: Without a picture for so long [s] something is wrong with where they come from.
 SILENCE = 2.0
@@ -45,6 +44,9 @@ ATTENTION_PERIOD = 0.2
 
 #: A picture older than this [s] is a recording; its age says nothing about latency.
 LONGEST_LATENCY = 0.3
+
+#: The tracker's thread looks so often whether it shall end [s].
+WAIT = 0.2
 
 
 class MarkerTracker(Node):
@@ -71,7 +73,6 @@ class MarkerTracker(Node):
         cv2.setNumThreads(1)  # the cores belong to the simulation
         self._settings = parameters = MarkerParameters(self)
         self._problems = Problems()
-        self._mailbox = Mailbox()
         self._tracker, self._tracker_error, self._rebuild = None, None, True
         self._tracking = None
         self._counts = {"processed": 0, "refused": 0}
@@ -82,14 +83,16 @@ class MarkerTracker(Node):
         )
         self._input_topics = self._find_topics()
         from_topics = not parameters.source
+        source = None if from_topics else self._make_source()  # a wrong one is noticed at once
         self._calibration = CalibrationChoice(
-            parameters["camera_info_url"], self._rectified(), expect_messages=from_topics
+            parameters["camera_info_url"], self._rectified(), from_topics or source.brings_camera
         )
-        if not from_topics:
-            self._make_source()  # so that a wrong one is noticed at once
+        if from_topics:
+            self._inbox = TopicInput(self, self._input_topics, self._calibration.hear)
+        else:
+            self._inbox = Mailbox()
         self._make_tracker()
-        self._listened = {}
-        self._awake_since = None
+        self._prepared, self._awake_since = False, None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(ATTENTION_PERIOD, self._attend, clock=steady)
@@ -128,7 +131,8 @@ class MarkerTracker(Node):
 
     def _attend(self):
         """Open what is needed and close what is not."""
-        awake = not self._settings["lazy"] or self._publications.listeners() > 0
+        wanted = not self._settings["lazy"] or self._publications.listeners() > 0
+        awake = wanted and self._prepared  # a short recording must not be over before that
         if awake and self._awake_since is None:
             self._awake_since = time.monotonic()
         elif not awake:
@@ -136,7 +140,7 @@ class MarkerTracker(Node):
         if self._settings.source:
             self._attend_source(awake)
         else:
-            self._attend_topics(awake)
+            self._inbox.listen(awake)
 
     def _attend_source(self, awake):
         if awake and self._source is None:
@@ -148,7 +152,7 @@ class MarkerTracker(Node):
     def _make_source(self):
         get = self._settings
         return make_source(
-            get.source, self._take, get["source_rate"], get["source_topic"], get["loop"]
+            get.source, self._put, get["source_rate"], get["source_topic"], get["loop"]
         )
 
     def _stop_source(self):
@@ -156,69 +160,28 @@ class MarkerTracker(Node):
             self._source.stop()
             self._source = None
 
-    def _attend_topics(self, awake):
-        """Hear camera_info always, raw pictures rather than compressed ones."""
-        wanted = {"camera_info": CameraInfo}
-        if awake:
-            raw = self.count_publishers(self._input_topics["image"])
-            compressed = self.count_publishers(self._input_topics["compressed"])
-            if raw or not compressed:
-                wanted["image"] = Image
-            else:
-                wanted["compressed"] = CompressedImage
-        for name in [name for name in self._listened if name not in wanted]:
-            self.destroy_subscription(self._listened.pop(name))
-        for name, message_type in wanted.items():
-            if name not in self._listened:
-                self._hear(name, message_type, reliable=True)
-
-    def _hear(self, name, message_type, reliable):
-        """Subscribe; reliable, since best effort loses large messages, but that gives way."""
-        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-
-        def give_way(_event):
-            if self._listened.get(name) is subscription:
-                self.destroy_subscription(subscription)
-                self._hear(name, message_type, reliable=False)
-
-        events = SubscriptionEventCallbacks(use_default_callbacks=False)
-        if reliable:
-            # Not in the event's own callback: it belongs to what is destroyed.
-            events.incompatible_qos = lambda event: self.executor.create_task(give_way, event)
-        callbacks = {
-            "camera_info": self._calibration.hear,
-            "image": lambda data: self._take(Encoded(IMAGE, data)),
-            "compressed": lambda data: self._take(Encoded(COMPRESSED_IMAGE, data)),
-        }
-        subscription = self.create_subscription(
-            message_type,
-            self._input_topics[name],
-            callbacks[name],
-            QoSProfile(depth=2, reliability=policy),
-            event_callbacks=events,
-            raw=True,
-        )
-        self._listened[name] = subscription
-
-    def _take(self, thing):
-        """A picture comes, or a bag's camera_info."""
+    def _put(self, thing):
+        """A source has a picture, or a bag's camera_info."""
         if isinstance(thing, Encoded) and thing.type == CAMERA_INFO:
             self._calibration.hear(thing.data)
-            return
-        self._last_picture = time.monotonic()
-        self._mailbox.put((thing, self.get_clock().now().nanoseconds))
+        else:
+            if isinstance(thing, Picture) and not thing.stamp_ns:
+                thing = thing._replace(stamp_ns=self.get_clock().now().nanoseconds)
+            self._inbox.put(thing)
 
     # ---------------------------------------------------------------- a picture
 
     def _work(self):
         """The tracker's thread."""
+        self._prepare()
         while self._running:
-            thing = self._mailbox.get(timeout=0.1)
-            if thing is None:
-                continue
-            begin = time.perf_counter()
+            begin = None
             try:
-                self._process(*thing)
+                thing = self._inbox.get(WAIT)
+                if thing is None:
+                    continue
+                begin = self._last_picture = time.monotonic()
+                self._process(thing)
                 self._counts["processed"] += 1
             except WaitingError:
                 continue
@@ -226,19 +189,31 @@ class MarkerTracker(Node):
                 if not (self._running and self.context.ok()):
                     return
                 self._counts["refused"] += 1
-                self._complain(_kind(error), " ".join(str(error).split()) or repr(error))
-            spent = 1e3 * (time.perf_counter() - begin)
+                self._complain(_kind(error), _one_line(error))
+                if begin is None:  # no picture, so nothing slows this loop down
+                    time.sleep(WAIT)
+                    continue
+            spent = 1e3 * (time.monotonic() - begin)
             self._milliseconds += 0.1 * (spent - self._milliseconds)
 
-    def _process(self, thing, arrival_ns):
-        pixels, encoding, stamp_ns, frame = _decoded(thing)
-        stamp_ns = stamp_ns or arrival_ns
+    def _prepare(self):
+        """Load the kernels before they are needed; say so where it takes long."""
+        log = self.get_logger()
+        try:
+            with tell_while_waiting(lambda s: log.info(f"preparing, first run: {s:.0f} s")):
+                prepare()
+        except Exception as error:  # then pictures will say what is wrong
+            self._complain("fault", f"preparing: {_one_line(error)}")
+        self._prepared = True
+
+    def _process(self, thing):
+        debug = self._publications.debug_due(self._settings["debug_rate"])
+        pixels, encoding, stamp_ns, frame = _decoded(thing, color=debug)
+        stamp_ns = stamp_ns or self.get_clock().now().nanoseconds
         gray = to_gray(pixels, encoding)
         height, width = gray.shape
-        self._size = f"{width} x {height} {encoding}"
-        picture = None
-        if self._publications.debug_due(self._settings["debug_rate"]):
-            picture = to_bgr(pixels, encoding).copy()
+        self._size = f"{width} x {height} {_format(thing, encoding)}"
+        picture = to_bgr(pixels, encoding).copy() if debug else None
         try:
             self._track(gray, stamp_ns, frame, picture)
         except (CameraError, TargetError, DictionaryError) as error:
@@ -259,7 +234,7 @@ class MarkerTracker(Node):
         world = tracker.settings.world
         self._publications.publish(tracking, stamp_ns, frame, world is not None)
         for problem in tracking.problems:
-            self._complain("marker twice" if "times" in problem else "world", problem)
+            self._complain(*problem)
         if picture is not None:
             targets = {t.name: t for t in (*tracker.settings.solids, *((world,) if world else ()))}
             notes = [note] if note else []
@@ -275,9 +250,8 @@ class MarkerTracker(Node):
         return age if 0.0 <= age <= LONGEST_LATENCY else 0.0
 
     def _complain(self, kind, text):
-        self._problems.note(kind, text)
-        if kind not in ("world", "approximate") or self._problems.counts[kind] % 150 == 1:
-            self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
+        if self._problems.note(kind, text):
+            self.get_logger().warning(text)
 
     # ---------------------------------------------------------------- parameters
 
@@ -306,12 +280,13 @@ class MarkerTracker(Node):
         if self._diagnostics.get_subscription_count() == 0:
             return
         name, idle = self.get_name(), self._awake_since is None
+        state = "pictures come" if self._prepared else "preparing"
         problems = {} if idle else {**self._problems.recent(), **self._silence()}
         if self._rebuild and idle:
             self._make_tracker()
         if self._tracker_error is not None:
             problems["marker size"] = str(self._tracker_error)
-        statuses = [input_status(name, "pictures come", self._facts(), problems, idle)]
+        statuses = [input_status(name, state, self._facts(), problems, idle and self._prepared)]
         tracking, tracker = self._tracking, self._tracker
         if tracker is not None:
             if tracker.settings.world is not None:
@@ -341,7 +316,7 @@ class MarkerTracker(Node):
             "source": self._settings.source or self._input_topics["image"],
             "pictures_processed": self._counts["processed"],
             "pictures_refused": self._counts["refused"],
-            "pictures_dropped": self._mailbox.dropped,
+            "pictures_dropped": self._inbox.dropped,
             "picture_time_ms": self._milliseconds,
             "picture": self._size,
             **{
@@ -350,17 +325,33 @@ class MarkerTracker(Node):
         }
 
 
-def _decoded(thing):
-    """(pixels, encoding, stamp_ns, frame_id) of what came in."""
+def _decoded(thing, color):
+    """(pixels, encoding, stamp_ns, frame_id); what is compressed becomes grey unless `color`."""
     if isinstance(thing, Picture):
         return thing.pixels, "bgr8", thing.stamp_ns, "camera"
     if thing.type == COMPRESSED_IMAGE:
         message = cdr_to_compressed_image(thing.data)
-        pixels, encoding = decode(message.data, message.format), "bgr8"
+        pixels = decode(message.data, message.format, color)
+        encoding = "bgr8" if color else "mono8"
     else:
         message = cdr_to_image(thing.data)
         pixels, encoding = message.pixels, message.encoding
     return pixels, encoding, message.header.stamp_ns, message.header.frame_id or "camera"
+
+
+def _format(thing, encoding):
+    """What pictures come as, for people."""
+    compressed = isinstance(thing, Encoded) and thing.type == COMPRESSED_IMAGE
+    return "compressed" if compressed else encoding
+
+
+def _one_line(error):
+    """For people; with the place in the code where the mistake is ours."""
+    text = " ".join(str(error).split())
+    if _kind(error) != "fault":
+        return text or repr(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {text}"
 
 
 def _kind(error):

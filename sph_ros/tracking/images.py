@@ -48,14 +48,20 @@ def to_bgr(pixels, encoding):
     return _converted(pixels, encoding, 1)
 
 
-def decode(data, image_format=""):
-    """The picture (H, W, 3) uint8 BGR in a compressed file's bytes.
+def decode(data, image_format="", color=True):
+    """The picture in a compressed file's bytes: (H, W, 3) uint8 BGR, or (H, W) uint8 grey.
+
+    Args:
+        data: the bytes.
+        image_format: for the error's text.
+        color: whether colours are wanted; grey is faster.
 
     Raises:
         ImageError: it is no picture that OpenCV can read.
     """
     buffer = np.frombuffer(data, np.uint8)
-    picture = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if len(buffer) else None
+    mode = cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
+    picture = cv2.imdecode(buffer, mode) if len(buffer) else None
     if picture is None:
         raise ImageError(
             f"compressed picture of {len(buffer)} bytes, format {image_format!r}: cannot be "
