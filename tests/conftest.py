@@ -21,3 +21,19 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip(f"real recordings are not on this machine: no folder {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def compiled_tracker():
+    """The tracker's kernels, which are compiled the first time: no test with a deadline waits."""
+    from sph_ros.tracking.preparation import prepare
+
+    prepare()
+
+
+@pytest.fixture(scope="session")
+def compiled_liquid():
+    """The same for the kernels of the simulation."""
+    from sph_ros.sim.kernels import ensure_compiled
+
+    ensure_compiled()

@@ -13,8 +13,11 @@ from tracking_helpers import (
     CAMERA_FROM_WORLD,
     CENTRE,
     FPS,
+    HARD_GAPS,
     WORLD,
+    SyntheticBoardCamera,
     errors,
+    hard_hand,
     rms,
     truth_of_hand,
 )
@@ -26,15 +29,14 @@ from sph_ros.tracking.detection import (
     Detector,
     DictionaryError,
     get_dictionary,
-    merged_regions,
-    region_around,
 )
 from sph_ros.tracking.images import ENCODINGS, ImageError, decode, to_bgr, to_gray
 from sph_ros.tracking.pose import estimate_poses
 from sph_ros.tracking.printing import CHARUCO, CUBE_EDGE, MARKER_SIZE, PAPERS
 from sph_ros.tracking.se3 import Pose, difference, exp, pose_from_quaternion
+from sph_ros.tracking.search import merged_regions, region_around
 from sph_ros.tracking.synthetic import Flaws, SyntheticCamera
-from sph_ros.tracking.targets import Target, charuco_corners, cube_corners, single_marker
+from sph_ros.tracking.targets import charuco_corners, single_marker
 from sph_ros.tracking.tracker import Tracker, TrackerSettings
 
 DPI = 200
@@ -159,76 +161,38 @@ def test_corners_of_rendered_markers_are_a_tenth_of_a_pixel_off():
     assert np.sqrt(np.mean(off**2)) < 0.15 and np.abs(off.mean(axis=(0, 1))).max() < 0.03
 
 
-def hard_pictures(seconds, flaws, seed=1, drop=()):
-    """Pictures of a hand, the truth, and the times; `drop` are ranges without the hand's marker."""
-    times, truth, _ = truth_of_hand(seconds, seed=seed, reach=0.03, tilt=0.25)
-    camera = SyntheticCamera(CAMERA, flaws=flaws)
-    for k, (time, pose) in enumerate(zip(times, truth, strict=True)):
-        placed = [(WORLD, CAMERA_FROM_WORLD)]
-        if not any(begin <= k < end for begin, end in drop):
-            after = truth[min(k + 1, len(truth) - 1)]
-            placed.append((BALL, _between(pose, after, flaws.exposure * FPS)))
-        yield time, pose, camera.take(placed, time)
-
-
-def _between(pose, after, share):
-    """The motion of a marker while the shutter is open, centred on the stamp."""
-    step = difference(after, pose)
-
-    def at(moment):
-        part = (moment - 0.5) * share * step
-        moved = Pose(exp(part[3:]) @ pose.rotation, pose.position + part[:3])
-        return CAMERA_FROM_WORLD @ moved
-
-    return at
-
-
 def test_hard_pictures_are_tracked():
-    """Noise, defocus, motion blur, changing light, occlusion, false ids, gaps of 1 to 30."""
-    flaws = Flaws(noise=6, defocus=0.9, exposure=0.008, light_change=0.3, light_gradient=0.6,
-                  occlusions=1, false_markers=2)  # fmt: skip
+    """Noise, defocus, motion blur, changing light, occlusion, false ids, gaps, a turn edge-on."""
     tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD))
-    results, truth, tracking = [], [], []
-    gaps = ((30, 31), (40, 43), (60, 90))
-    for time, pose, picture in hard_pictures(4.0, flaws, drop=gaps):
+    results, (times, truth, pictures) = [], hard_hand()
+    for time, picture in zip(times, pictures, strict=True):
         result = tracker.process(picture, round((5.0 + time) * 1e9), CAMERA)
         assert {d.id for d in result.detections} <= {0, 1}
         results.append(result.solids["ball"])
-        truth.append(pose)
-        tracking.append(result.solids["ball"].status == "tracking")
-    off, tracking = errors(results, truth), np.array(tracking)
-    assert tracking.mean() > 0.5
-    assert rms(off[tracking, :3]) < 0.006 and np.degrees(rms(off[tracking, 3:])) < 4.0
+    off = errors(results, truth)
+    tracking = np.array([result.status == "tracking" for result in results])
+    assert tracking.mean() > 0.4  # in 0.57 it can be seen at all
+    assert rms(off[tracking, :3]) < 0.003 and np.degrees(rms(off[tracking, 3:])) < 2.0
     shown = off[~np.isnan(off[:, 0])]
     assert np.linalg.norm(shown[:, :3], axis=1).max() < 0.12  # also while it coasts
-    assert results[85].pose is None and results[85].status == "lost"
+    begin, end = HARD_GAPS[-1]
+    assert end - begin == 30 and results[end - 5].pose is None
+    assert results[end - 5].status == "lost" and results[end + 4].status == "tracking"
 
 
 def test_regions_of_interest_find_what_the_whole_picture_shows():
     full = Tracker(TrackerSettings(solids=(BALL,), world=WORLD, full_interval=0.0))
     tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD))
+    times, truth, _ = truth_of_hand(2.0, reach=0.03, tilt=0.25)
+    camera = SyntheticCamera(CAMERA)
     searched = 0
-    for time, _, picture in hard_pictures(2.0, Flaws()):
-        stamp = round((5.0 + time) * 1e9)
-        a, b = (t.process(picture, stamp, CAMERA) for t in (full, tracker))
+    for time, pose in zip(times, truth, strict=True):
+        picture = camera.take([(WORLD, CAMERA_FROM_WORLD), (BALL, CAMERA_FROM_WORLD @ pose)])
+        a, b = (t.process(picture, round((5.0 + time) * 1e9), CAMERA) for t in (full, tracker))
         assert {d.id for d in a.detections} == {d.id for d in b.detections}
         assert a.regions is None
         searched += b.regions is None
     assert searched <= 15  # of 60
-
-
-def test_a_cube_is_followed_all_the_way_round():
-    cube = Target("wand", cube_corners(0.06, 0.05, [2, 3, 4, 5, 6, 7]))
-    camera = SyntheticCamera(CAMERA, flaws=Flaws())
-    tracker = Tracker(TrackerSettings(solids=(cube,)))
-    off = []
-    for k in range(50):
-        turn = exp(np.array([0.5, 0.3, 0.0])) @ exp(np.array([0.0, 0.0, 2 * np.pi * k / 50]))
-        pose = Pose(turn, np.array([0.0, 0.0, 0.4]))
-        result = tracker.process(camera.take([(cube, pose)]), round((k / FPS + 1) * 1e9), CAMERA)
-        off.append(difference(result.solids["wand"].pose, pose))
-    off = np.array(off)
-    assert rms(off[:, :3]) < 0.003 and np.degrees(rms(off[:, 3:])) < 2.0
 
 
 def test_a_marker_seen_edge_on_comes_back():
@@ -321,12 +285,14 @@ def test_dictionaries_are_checked():
 
 
 def test_regions():
-    assert region_around(np.array([[100.0, 100.0], [200.0, 150.0]]), (480, 640)) == (
-        40, 40, 261, 211,
-    )  # fmt: skip
-    assert region_around(np.array([[-100.0, -100.0], [-90.0, -90.0]]), (480, 640))[2] == 0
-    merged = merged_regions([(0, 0, 10, 10), (5, 5, 20, 20), (40, 40, 50, 50), (15, 0, 30, 8)])
-    assert sorted(merged) == [(0, 0, 30, 20), (40, 40, 50, 50)]
+    inside, outside = np.array([[100.0, 100.0], [200.0, 150.0]]), np.array([[-100.0, -100.0]])
+    assert region_around(inside, (480, 640), 0.6, 24.0) == (40, 40, 261, 211)
+    assert region_around(outside, (480, 640), 0.6, 24.0)[2] == 0
+    apart = [(0, 0, 10, 10), (9, 9, 20, 20)]  # the one around both is twice as large as both
+    assert merged_regions(apart) == apart
+    # The one around the last two is worth being joined with the first, which neither of them was.
+    regions = [(0, 8, 20, 20), (40, 40, 50, 50), (0, 0, 11, 10), (9, 0, 20, 10)]
+    assert sorted(merged_regions(regions)) == [(0, 0, 20, 20), (40, 40, 50, 50)]
 
 
 # ---------------------------------------------------------------- printing, calibration
@@ -359,7 +325,6 @@ def test_printed_markers_have_their_true_size(paper, tmp_path, capsys):
 def test_calibrate_finds_the_camera_that_took_the_pictures(tmp_path, capsys):
     """Rendered pictures of the printed board; focal length to half a percent."""
     true = CameraModel(640, 480, [[600, 0, 330], [0, 603, 235], [0, 0, 1]], [0.12, -0.25, 0, 0, 0])
-    board = Target("board", charuco_corners(*CHARUCO))
     camera = SyntheticBoardCamera(true)
     rng = np.random.default_rng(3)
     folder = tmp_path / "pictures"
@@ -367,7 +332,7 @@ def test_calibrate_finds_the_camera_that_took_the_pictures(tmp_path, capsys):
     for k in range(14):
         turn = exp(rng.uniform(-0.6, 0.6, 3)) @ np.diag([1.0, -1.0, -1.0])
         place = np.array([*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.3, 0.45)])
-        cv2.imwrite(str(folder / f"{k:02}.png"), camera.take(board, Pose(turn, place)))
+        cv2.imwrite(str(folder / f"{k:02}.png"), camera.take(Pose(turn, place)))
     out = tmp_path / "camera.yaml"
     assert main(["calibrate", str(folder), "--out", str(out)]) == 0
     found = load_camera(out)
@@ -375,48 +340,6 @@ def test_calibrate_finds_the_camera_that_took_the_pictures(tmp_path, capsys):
     assert np.allclose(found.matrix[:2, 2], (330, 235), atol=4)
     rays = np.array([[x, y, 1.0] for x in (-0.4, 0, 0.4) for y in (-0.3, 0, 0.3)])
     assert np.abs(found.project(rays) - true.project(rays)).max() < 2.0
-
-
-class SyntheticBoardCamera:
-    """Takes pictures of a ChArUco board, whose black squares the marker camera does not know."""
-
-    def __init__(self, camera):
-        self._camera = camera
-        self._pixels_per_metre = 4000
-        self._sheet = self._draw_sheet()
-        y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
-        self._grid = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
-
-    def _draw_sheet(self):
-        scale, side = self._pixels_per_metre, round(CHARUCO.square * self._pixels_per_metre)
-        sheet = np.full((CHARUCO.rows * side, CHARUCO.columns * side), 255, np.uint8)
-        for row in range(CHARUCO.rows):
-            for column in range(CHARUCO.columns):
-                if (row + column) % 2 == 0:
-                    sheet[row * side :, column * side :][:side, :side] = 0
-        middle = np.array([sheet.shape[1], sheet.shape[0]]) / 2
-        size = round(CHARUCO.size * scale)
-        from sph_ros.tracking.detection import marker_picture
-
-        for marker_id, corners in charuco_corners(*CHARUCO).items():
-            left, top = np.round(middle + corners[0, :2] * (scale, -scale)).astype(int)
-            picture = marker_picture(get_dictionary("DICT_4X4_50"), marker_id, size)
-            sheet[top : top + size, left : left + size] = picture
-        return cv2.GaussianBlur(np.pad(sheet, 200, constant_values=255), (0, 0), 3.0)
-
-    def take(self, board, pose):
-        """Each pixel's ray meets the sheet where the picture's grey value comes from."""
-        camera = self._camera
-        rays = cv2.undistortPoints(self._grid, camera.matrix, camera.distortion)[:, 0]
-        rays = np.column_stack([rays, np.ones(len(rays))])
-        normal = pose.rotation[:, 2]
-        points = rays * ((normal @ pose.position) / (rays @ normal))[:, None]
-        on_sheet = (points - pose.position) @ pose.rotation[:, :2] * self._pixels_per_metre
-        middle = (np.array(self._sheet.shape[::-1]) - 1) / 2
-        place = (on_sheet * (1, -1) + middle).astype(np.float32)
-        place = place.reshape(camera.height, camera.width, 2)
-        picture = cv2.remap(self._sheet, place, None, cv2.INTER_LINEAR, borderValue=150)
-        return cv2.GaussianBlur(picture, (0, 0), 0.6)
 
 
 def test_calibration_needs_pictures(tmp_path, capsys):

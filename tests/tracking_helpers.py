@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera, two markers and a hand whose motion is known, at the level of corners: no pictures."""
 
-import contextlib
+import functools
 
 import cv2
 import numpy as np
 
 from sph_ros.tracking.camera import CameraModel
-from sph_ros.tracking.detection import Detection
+from sph_ros.tracking.detection import Detection, get_dictionary, marker_picture
 from sph_ros.tracking.motions import hand_motion
+from sph_ros.tracking.printing import CHARUCO
 from sph_ros.tracking.se3 import Pose, difference, exp
-from sph_ros.tracking.targets import single_marker
+from sph_ros.tracking.synthetic import Flaws, SyntheticCamera
+from sph_ros.tracking.targets import charuco_corners, single_marker
 from sph_ros.tracking.tracker import Tracker, TrackerSettings
 
 FPS = 30.0
@@ -28,6 +30,49 @@ def truth_of_hand(seconds, seed=1, **motion):
     """(times (N,), [world_from_ball], moving (N,) bool)."""
     times = np.arange(round(seconds * FPS)) / FPS
     return times, *hand_motion(times, CENTRE, seed=seed, **motion)
+
+
+#: Pictures of `hard_hand` in which the hand's marker is out of sight.
+HARD_GAPS = ((20, 21), (30, 33), (45, 75))
+
+_HARD = Flaws(
+    noise=6,
+    defocus=0.9,
+    exposure=0.008,
+    light_change=0.3,
+    light_gradient=0.6,
+    occlusions=1,
+    false_markers=2,
+)
+
+
+@functools.cache
+def hard_hand():
+    """(times, [world_from_ball], pictures) of a hand with all flaws; near the end it turns away."""
+    times, truth, _ = truth_of_hand(4.0, reach=0.03, tilt=0.25)
+    turns = np.clip((times - 3.0) / 0.5, 0.0, 1.0)
+    away = exp(1.3 * np.sin(np.pi * turns)[:, None] * (1.0, 0.0, 0.0))
+    truth = [Pose(a @ pose.rotation, pose.position) for a, pose in zip(away, truth, strict=True)]
+    camera = SyntheticCamera(CAMERA, flaws=_HARD)
+    pictures = []
+    for k, pose in enumerate(truth):
+        placed = [(WORLD, CAMERA_FROM_WORLD)]
+        if not any(begin <= k < end for begin, end in HARD_GAPS):
+            after = truth[min(k + 1, len(truth) - 1)]
+            placed.append((BALL, _during_exposure(pose, after)))
+        pictures.append(camera.take(placed, times[k]))
+    return times, truth, pictures
+
+
+def _during_exposure(pose, after):
+    """camera_from_ball as a function of the share of the exposure, centred on the stamp."""
+    step = difference(after, pose) * (_HARD.exposure * FPS)
+
+    def at(moment):
+        part = (moment - 0.5) * step
+        return CAMERA_FROM_WORLD @ Pose(exp(part[3:]) @ pose.rotation, pose.position + part[:3])
+
+    return at
 
 
 def seen(target, camera_from_target, rng, noise=0.3, camera=CAMERA):
@@ -105,10 +150,41 @@ def plain_pose(pixels, size, camera=CAMERA):
     return Pose(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
-@contextlib.contextmanager
-def one_opencv_thread():
-    """Tests share their two cores."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    yield
-    cv2.setNumThreads(before)
+class SyntheticBoardCamera:
+    """Takes pictures of the printed ChArUco board, whose black squares SyntheticCamera lacks."""
+
+    def __init__(self, camera):
+        self._camera = camera
+        self._pixels_per_metre = 4000
+        self._sheet = self._draw_sheet()
+        y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32)
+        self._grid = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
+
+    def _draw_sheet(self):
+        scale, side = self._pixels_per_metre, round(CHARUCO.square * self._pixels_per_metre)
+        sheet = np.full((CHARUCO.rows * side, CHARUCO.columns * side), 255, np.uint8)
+        for row in range(CHARUCO.rows):
+            for column in range(CHARUCO.columns):
+                if (row + column) % 2 == 0:
+                    sheet[row * side :, column * side :][:side, :side] = 0
+        middle = np.array([sheet.shape[1], sheet.shape[0]]) / 2
+        size = round(CHARUCO.size * scale)
+        for marker_id, corners in charuco_corners(*CHARUCO).items():
+            left, top = np.round(middle + corners[0, :2] * (scale, -scale)).astype(int)
+            picture = marker_picture(get_dictionary("DICT_4X4_50"), marker_id, size)
+            sheet[top : top + size, left : left + size] = picture
+        return cv2.GaussianBlur(np.pad(sheet, 200, constant_values=255), (0, 0), 3.0)
+
+    def take(self, pose):
+        """Each pixel's ray meets the sheet where the picture's grey value comes from."""
+        camera = self._camera
+        rays = cv2.undistortPoints(self._grid, camera.matrix, camera.distortion)[:, 0]
+        rays = np.column_stack([rays, np.ones(len(rays))])
+        normal = pose.rotation[:, 2]
+        points = rays * ((normal @ pose.position) / (rays @ normal))[:, None]
+        on_sheet = (points - pose.position) @ pose.rotation[:, :2] * self._pixels_per_metre
+        middle = (np.array(self._sheet.shape[::-1]) - 1) / 2
+        place = (on_sheet * (1, -1) + middle).astype(np.float32)
+        place = place.reshape(camera.height, camera.width, 2)
+        picture = cv2.remap(self._sheet, place, None, cv2.INTER_LINEAR, borderValue=150)
+        return cv2.GaussianBlur(picture, (0, 0), 0.6)
