@@ -8,6 +8,7 @@ from sph_ros.sim.shapes import Container
 #: Red, green, blue, alpha.
 LIQUID = (0.20, 0.45, 0.75, 0.8)
 CONTAINER = (0.70, 0.70, 0.70, 0.15)
+GLASS = (0.75, 0.85, 0.85, 0.25)
 
 #: Of solids for which the scene gives none, in turn: red, green, blue.
 SOLIDS = ((0.90, 0.48, 0.32), (0.93, 0.76, 0.32), (0.48, 0.69, 0.38), (0.62, 0.46, 0.73))
@@ -23,6 +24,11 @@ _SPEED_STOPS = np.array(
 )
 
 
+def liquid_color(material):
+    """Red, green, blue, alpha of a liquid where it is drawn as a plain surface."""
+    return LIQUID if material.color is None else (*material.color, 1.0)
+
+
 def solid_colors(scene):
     """Red, green, blue, alpha of every solid of a scene by name: the scene's, or one of ours."""
     colors, chosen = {}, 0
@@ -30,7 +36,9 @@ def solid_colors(scene):
         if isinstance(solid.shape, Container):
             colors[solid.name] = CONTAINER
         elif solid.color is not None:
-            colors[solid.name] = (*solid.color, 1.0)
+            colors[solid.name] = (*solid.color, GLASS[3] if solid.see_through else 1.0)
+        elif solid.see_through:
+            colors[solid.name] = GLASS
         else:
             colors[solid.name] = (*SOLIDS[chosen % len(SOLIDS)], 1.0)
             chosen += 1

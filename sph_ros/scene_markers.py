@@ -5,7 +5,7 @@ from msg_adapters.marker import triangle_marker
 from sph_ros.colors import LIQUID, solid_colors
 
 
-def surface_marker(vertices, triangles, stamp_ns, frame_id):
+def surface_marker(vertices, triangles, stamp_ns, frame_id, color=LIQUID):
     """The liquid's surface; a marker that deletes it where there are no triangles.
 
     Args:
@@ -13,9 +13,10 @@ def surface_marker(vertices, triangles, stamp_ns, frame_id):
         triangles: (T, 3).
         stamp_ns: [ns].
         frame_id: of the vertices.
+        color: red, green, blue, alpha.
     """
     return triangle_marker(
-        vertices, triangles, stamp_ns, frame_id, namespace="surface", color=LIQUID
+        vertices, triangles, stamp_ns, frame_id, namespace="surface", color=color
     )
 
 
