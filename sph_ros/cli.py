@@ -8,7 +8,7 @@ import argparse
 import os
 import sys
 
-from sph_ros.options import picture_size, positive, remapping
+from sph_ros.options import count, numbers, picture_size, positive, remapping
 
 
 def main(argv=None):
@@ -69,6 +69,7 @@ def _parser():
         "demo", help="the node, a recorded hand and a live view at once", add_help=False
     )
     _add_simulate(commands)
+    _add_study(commands)
     _add_tracking(commands)
     return parser
 
@@ -93,7 +94,7 @@ def _add_simulate(commands):
         help="poses on the bag's topic A move the solid B (a name, or its pose topic); may repeat",
     )
     add("--ignore-frame", action="store_true", help="take poses in any frame as the scene's frame")
-    add("--seconds", type=positive, help="how long; default: the bag's length, else 5")
+    add("--seconds", type=positive, help="how long; default: the bag's, the scene's, or 5")
     add("--out", metavar="DIR", help="folder to make; default: out/SCENE")
     add("--force", action="store_true", help="replace results that DIR holds already")
     add("--fps", type=positive, default=30.0, help="recorded frames per second (default: 30)")
@@ -102,6 +103,26 @@ def _add_simulate(commands):
         "--size", type=picture_size, default=(960, 720), metavar="WxH", help="of the video [pixels]"
     )
     simulate.set_defaults(run=_simulate)
+
+
+def _add_study(commands):
+    study = commands.add_parser(
+        "study",
+        help="for which wall does the house of dam_house_2d stay dry",
+        description="Run dam_house_2d with walls of many heights and positions, spread over the "
+        "cores. Prints a table and for which walls the house stays dry; DIR gets study.csv and "
+        "study.png.",
+    )
+    add = study.add_argument
+    add("scene", metavar="SCENE", help="dam_house_2d")
+    add("--heights", type=numbers, metavar="H,H,...", help="of the wall [m]; or FIRST:LAST:STEP")
+    add("--positions", type=numbers, metavar="X,X,...", help="of its left face [m]; or a range")
+    add("--seconds", type=positive, help="of each run (default: the scene's)")
+    add("--solver", help="instead of the scene's")
+    add("--workers", type=count, metavar="N", help="processes at once (default: all cores)")
+    add("--out", metavar="DIR", help="folder to make; default: out/study_SCENE")
+    add("--force", action="store_true", help="replace results that DIR holds already")
+    study.set_defaults(run=_study)
 
 
 def _add_tracking(commands):
@@ -166,6 +187,23 @@ def _simulate(options):
     )
     print(summary)
     return 0 if summary.complete else 130
+
+
+def _study(options):
+    from sph_ros.study import HEIGHTS, POSITIONS, report, study
+
+    outcomes = study(
+        options.scene,
+        options.heights or HEIGHTS,
+        options.positions or POSITIONS,
+        seconds=options.seconds,
+        solver=options.solver,
+        workers=options.workers,
+        out=options.out,
+        force=options.force,
+    )
+    print(report(outcomes))
+    return 0
 
 
 if __name__ == "__main__":

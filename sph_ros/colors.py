@@ -8,6 +8,7 @@ from sph_ros.sim.shapes import Container
 #: Red, green, blue, alpha.
 LIQUID = (0.20, 0.45, 0.75, 0.8)
 CONTAINER = (0.70, 0.70, 0.70, 0.15)
+GLASS = (0.75, 0.85, 0.85, 0.25)
 
 #: Of solids for which the scene gives none, in turn: red, green, blue.
 SOLIDS = ((0.90, 0.48, 0.32), (0.93, 0.76, 0.32), (0.48, 0.69, 0.38), (0.62, 0.46, 0.73))
@@ -27,6 +28,11 @@ _SPEED_STOPS = np.array(
 )
 
 
+def liquid_color(material):
+    """Red, green, blue, alpha of a liquid where it is drawn as a plain surface."""
+    return LIQUID if material.color is None else (*material.color, 1.0)
+
+
 def solid_colors(scene):
     """Red, green, blue, alpha of every solid of a scene by name: the scene's, or one of ours."""
     colors, chosen = {}, 0
@@ -34,7 +40,9 @@ def solid_colors(scene):
         if isinstance(solid.shape, Container):
             colors[solid.name] = CONTAINER
         elif solid.color is not None:
-            colors[solid.name] = (*solid.color, 1.0)
+            colors[solid.name] = (*solid.color, GLASS[3] if solid.see_through else 1.0)
+        elif solid.see_through:
+            colors[solid.name] = GLASS
         else:
             colors[solid.name] = (*SOLIDS[chosen % len(SOLIDS)], 1.0)
             chosen += 1
@@ -51,11 +59,12 @@ def speed_colors(shares):
     return np.stack([np.interp(shares, at, stops[:, c]) for c in range(3)], axis=1)
 
 
-def shaded_liquid(normals):
+def shaded_liquid(normals, color=LIQUID[:3]):
     """The liquid's colour lit from above, for viewers that cannot shade smoothly by themselves.
 
     Args:
         normals: unit outward normals, (V, 3), z up.
+        color: red, green, blue of the liquid.
 
     Returns:
         red, green, blue, alpha (V, 4) float32: light from the sky and a soft gleam of the sun.
@@ -64,7 +73,7 @@ def shaded_liquid(normals):
     light = _LEAST_LIGHT + (1.0 - _LEAST_LIGHT) * (0.5 + 0.5 * toward_sun)
     gleam = _GLEAM * np.maximum(toward_sun, 0.0) ** _GLOSS
     colors = np.ones((len(normals), 4), np.float32)
-    colors[:, :3] = light[:, None] * np.array(LIQUID[:3]) * _BRIGHTNESS
+    colors[:, :3] = light[:, None] * np.array(color) * _BRIGHTNESS
     colors[:, :3] += gleam[:, None] * (1.0 - colors[:, :3])
     return np.minimum(colors, 1.0)
 

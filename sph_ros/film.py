@@ -17,7 +17,8 @@ from sph_ros.sim.shapes import Container, Plane, display_mesh
 class Film:
     """Draws states of a scene one after the other; a context manager.
 
-    The camera stands so that the liquid and all visible solids of the first state are in view.
+    The camera stands so that the liquid, the emitters and all visible solids of the first state are
+    in view.
 
     Args:
         scene: the Scene.
@@ -60,12 +61,18 @@ class Film:
             views,
             scene.spacing,
             dimension=scene.dimension,
+            colours=self._colours(len(positions)),
         )
         if self._camera is None:
-            bounds = self._solids.bounds(frame)
+            bounds = self._solids.bounds(frame, scene.emitters)
             self._camera = Camera.fit(*bounds, aspect=self._size[0] / self._size[1])
         self._picture = render(frame, self._camera, self._size)
         self._video.add(self._picture)
+
+    def _colours(self, count):
+        """Red, green, blue of each of `count` particles, None for a clear liquid."""
+        color = self._scene.material.color
+        return None if color is None else np.tile(np.array(color), (count, 1))
 
 
 class _Solids:
@@ -84,15 +91,18 @@ class _Solids:
                 *self._meshes[name],
                 *poses[name],
                 container=isinstance(spec.shape, Container),
+                wireframe=spec.see_through,
                 color=self._colors[name][:3],
             )
             for name, spec in self._specs.items()
             if name in poses
         ]
 
-    def bounds(self, frame):
-        """(lower, upper) corner [m] of liquid and solids; planes are endless and do not count."""
-        points = [np.array(frame.bounds())]
+    def bounds(self, frame, emitters):
+        """(lower, upper) corner [m] of all but the planes, which are endless and do not count."""
+        points = [np.array(frame.bounds()) if len(frame.positions) else np.empty((0, 3))]
+        for emitter in emitters:
+            points.append(np.array(emitter.position) + [[-emitter.radius], [emitter.radius]])
         for view in frame.solids:
             if not isinstance(self._specs[view.name].shape, Plane):
                 points.append(view.world_vertices())

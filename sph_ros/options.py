@@ -42,3 +42,36 @@ def _number(text, wanted, accepted):
     if not (math.isfinite(value) and accepted(value)):
         raise argparse.ArgumentTypeError(f"expected a number {wanted}, got {text!r}")
     return value
+
+
+def count(text):
+    """Argparse type: a whole number above 0."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
+    return number
+
+
+def numbers(text):
+    """Argparse type: `1,1.5,2`, or `1:2:0.5` for the same, as a tuple of floats."""
+    separator = ":" if ":" in text else ","
+    try:
+        values = [float(part) for part in text.split(separator)]
+    except ValueError:
+        values = []
+    if not values or not all(math.isfinite(value) for value in values):
+        raise argparse.ArgumentTypeError(
+            f"expected numbers such as 1,1.5,2 or FIRST:LAST:STEP, got {text!r}"
+        )
+    if separator == ",":
+        return tuple(dict.fromkeys(values))
+    if len(values) != 3 or values[2] <= 0.0 or values[1] < values[0]:
+        raise argparse.ArgumentTypeError(f"expected FIRST:LAST:STEP, got {text!r}")
+    first, last, step = values
+    steps = int((last - first) / step + 1e-6)
+    if steps > 1000:
+        raise argparse.ArgumentTypeError(f"expected at most 1000 numbers, got {text!r}")
+    return tuple(round(first + index * step, 9) for index in range(steps + 1))

@@ -5,7 +5,7 @@ from msg_adapters.marker import triangle_marker
 from sph_ros.colors import LIQUID, shaded_liquid, solid_colors
 
 
-def surface_marker(vertices, triangles, normals, stamp_ns, frame_id):
+def surface_marker(vertices, triangles, normals, stamp_ns, frame_id, color=LIQUID):
     """The liquid's surface; a marker that deletes it where there are no triangles.
 
     A marker has no normals, and RViz shades every triangle by its own: each would show. So every
@@ -18,6 +18,7 @@ def surface_marker(vertices, triangles, normals, stamp_ns, frame_id):
         normals: of the vertices, unit and outward, (V, 3).
         stamp_ns: [ns].
         frame_id: of the vertices.
+        color: red, green, blue, alpha.
     """
     return triangle_marker(
         vertices,
@@ -25,8 +26,8 @@ def surface_marker(vertices, triangles, normals, stamp_ns, frame_id):
         stamp_ns,
         frame_id,
         namespace="surface",
-        color=LIQUID[:3],
-        vertex_colors=shaded_liquid(normals),
+        color=color[:3],
+        vertex_colors=shaded_liquid(normals, color[:3]),
     )
 
 

@@ -83,7 +83,7 @@ def simulate(
         bag: packaged name or path of a recording that moves solids, see `read_tracks`.
         remaps: topic of the bag -> solid.
         ignore_frame: take poses in any frame as the scene's frame.
-        seconds: how long [s]; None for the bag's length, or DEFAULT_SECONDS.
+        seconds: how long [s]; None for the bag's length, else the scene's, or DEFAULT_SECONDS.
         fps: recorded frames per second.
         size: of the video (width, height) [pixels], None for no video and no picture.
         force: replace results that are in the folder already.
@@ -106,7 +106,7 @@ def simulate(
         sim = Simulation(scene)
         warm_up(sim)
     wanted = seconds or max((float(track.times[-1]) for track in tracks), default=0.0)
-    wanted = wanted or DEFAULT_SECONDS
+    wanted = wanted or scene.duration or DEFAULT_SECONDS
     for track in tracks:
         for moment, position, quat_xyzw in zip(*track[1:], strict=True):
             sim.move_solid(track.solid, position, quat_xyzw, time=float(moment))

@@ -15,6 +15,7 @@ from msg_adapters.marker import delete_marker, marker_to_cdr, markers_to_cdr
 from msg_adapters.mesh import mesh_to_cdr
 from msg_adapters.point_cloud import particle_cloud_to_cdr
 from msg_adapters.wrench import wrench_to_cdr
+from sph_ros.colors import liquid_color
 from sph_ros.core.surface import extract_surface
 from sph_ros.scene_markers import SolidMarkers, surface_marker
 from sph_ros.sim.scene_types import Scene
@@ -99,7 +100,8 @@ class Publications:
             job.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
         )
         if _heard(self._surface):
-            marker = surface_marker(vertices, triangles, normals, job.stamp_ns, scene.frame)
+            color = liquid_color(scene.material)
+            marker = surface_marker(vertices, triangles, normals, job.stamp_ns, scene.frame, color)
             self._surface.publish(marker_to_cdr(marker))
         if _heard(self._surface_mesh):
             self._surface_mesh.publish(mesh_to_cdr(vertices, triangles))

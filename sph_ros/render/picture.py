@@ -7,11 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sph_ros.colors import LIQUID, SOLIDS, linear, speed_colors
 from sph_ros.render.camera import Camera
 from sph_ros.render.light_map import floor_light
 from sph_ros.render.raster import (
+    NEAR,
     draw_lines,
     draw_liquid,
     draw_solids,
@@ -71,6 +73,7 @@ class Frame:
         floor_z: height of the floor [m]; None: under everything.
         top_speed: speed of the brightest colour [m/s]; None: the fastest particle.
         dimension: 3, or 2 for a liquid in the x-z plane, which is then tinted as if it were deep.
+        colours: sRGB 0 to 1 of every particle (N, 3), which makes the liquid opaque; None: clear.
     """
 
     positions: np.ndarray
@@ -81,6 +84,7 @@ class Frame:
     floor_z: float | None = None
     top_speed: float | None = None
     dimension: int = 3
+    colours: np.ndarray | None = None
 
     def bounds(self):
         """Lower and upper corner of containers, liquid and finite-sized solids [m], (3,) each."""
@@ -110,9 +114,10 @@ def render(frame: Frame, camera: Camera, size=(1280, 720), supersample=2) -> np.
     if width < 1 or height < 1 or supersample < 1:
         raise ValueError(f"picture: size {size}, supersample {supersample}, expected 1 or more")
     fine = (width * supersample, height * supersample)
-    solids = _draw_opaque(frame, camera, fine)
     surface = surface_at_walls(frame)
-    liquid = _draw_liquid(surface, camera, fine, solids[0])
+    clear = frame.colours is None
+    solids = _draw_opaque(frame, camera, fine, None if clear else surface)
+    liquid = _draw_liquid(surface if clear else None, camera, fine, solids[0])
     lines = _draw_outlines(frame, camera, fine, solids[0], supersample)
     lower, upper = frame.bounds()
     scene_size = max(float(np.linalg.norm(upper - lower)), frame.spacing)
@@ -153,7 +158,9 @@ def save_png(path, picture) -> None:
 
 
 def _particle_colours(frame):
-    """Linear RGB per particle: its speed's, or the liquid's where that is unknown, (N, 3)."""
+    """Linear RGB per particle: its own, its speed's, or water's where both are unknown, (N, 3)."""
+    if frame.colours is not None:
+        return linear(frame.colours).astype(np.float32)
     if frame.velocities is None:
         return np.tile(np.float32(linear(LIQUID[:3])), (len(frame.positions), 1))
     speed = np.linalg.norm(frame.velocities, axis=1)
@@ -161,8 +168,24 @@ def _particle_colours(frame):
     return linear(speed_colors(speed / top)).astype(np.float32)
 
 
-def _draw_opaque(frame, camera, size):
-    """Depth (H, W) and linear RGB (H, W, 3) of solids, and of particles if there is no surface."""
+def _draw_opaque_liquid(frame, camera, size, surface, depth, picture):
+    """Draw a surface whose triangles have the colour of the nearest particle."""
+    vertices, triangles, normals = surface
+    points = np.asarray(vertices, np.float64)[triangles]
+    # Clipping would part triangles from their colours.
+    ahead = (camera.to_camera(points.reshape(-1, 3))[:, 2] > 2.0 * NEAR).reshape(-1, 3).all(axis=1)
+    points, triangles = points[ahead], triangles[ahead]
+    _, nearest = cKDTree(frame.positions).query(points.mean(axis=1))
+    colours = _particle_colours(frame)[nearest]
+    corners, normals = projected_corners(points, normals[triangles], camera, size)
+    draw_solids(corners, normals, colours, view_rays(camera, size), depth, picture)
+
+
+def _draw_opaque(frame, camera, size, surface):
+    """Depth (H, W) and linear RGB (H, W, 3) of what one cannot see through.
+
+    That is the solids, the particles if there is no surface, and the `surface` of an opaque liquid.
+    """
     depth = np.full(size[::-1], np.inf, np.float32)
     picture = np.zeros((*size[::-1], 3), np.float32)
     view = view_rays(camera, size)
@@ -178,6 +201,8 @@ def _draw_opaque(frame, camera, size):
         centres = np.concatenate([image, z[:, None]], axis=1).astype(np.float32)
         focal, radius = camera.intrinsics(size)[0], 0.5 * frame.spacing
         draw_spheres(centres, radius, _particle_colours(frame), view, focal, depth, picture)
+    if surface is not None and len(surface[1]):
+        _draw_opaque_liquid(frame, camera, size, surface, depth, picture)
     return depth, picture
 
 
@@ -233,7 +258,7 @@ def _draw_outlines(frame, camera, size, solid_depth, supersample):
 
 
 def _outlines(solid, camera):
-    """Ends of creases and silhouettes (L, 2, 3) [m], and whether each is on the camera's side."""
+    """Ends of creases, silhouettes and open edges (L, 2, 3) [m]; which are on the camera's side."""
     points = solid.world_vertices()
     triangles = np.asarray(solid.triangles, np.int64)
     _, first, same = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
@@ -252,7 +277,10 @@ def _outlines(solid, camera):
     one, other = owner[pair], owner[pair + 1]
     crease = np.einsum("ij,ij->i", faces[one], faces[other]) < np.cos(np.radians(CREASE_ANGLE))
     drawn = crease | (seen[one] != seen[other])
-    return points[edges[pair[drawn]]], (seen[one] | seen[other])[drawn]
+    single = np.ones(len(edges), bool)
+    single[pair] = single[pair + 1] = False
+    chosen = np.concatenate([edges[pair[drawn]], edges[single]])
+    return points[chosen], np.concatenate([(seen[one] | seen[other])[drawn], seen[owner[single]]])
 
 
 def _lights(frame, surface, lower, upper, scene_size, pixel_angle):

@@ -4,7 +4,7 @@
 import dataclasses
 from dataclasses import dataclass
 
-from sph_ros.sim.quantities import check_quantities, limits_of, quantity
+from sph_ros.sim.quantities import Vector, check_quantities, limits_of, quantity
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Material:
         wall_friction: 0 lets the liquid slip along solids, 1 drags it with them [-].
         adhesion: how strongly solids hold the liquid, as a share of its own cohesion [-].
         quadratic_viscosity: Clavet's beta times the spacing: damps pairs that collide fast [-].
+        color: red, green, blue, 0 to 1, of a liquid that is drawn opaque; None: clear as water.
     """
 
     name: str = "water"
@@ -31,6 +32,7 @@ class Material:
     wall_friction: float = quantity("1", 0.1, low=0.0, high=1.0)
     adhesion: float = quantity("1", 0.5, low=0.0, high=1.0)
     quadratic_viscosity: float = quantity("1", 0.3, low=0.0, high=10.0)
+    color: Vector | None = quantity("1", None, low=0.0, high=1.0)
 
     def __post_init__(self):
         """Refuse what is no number or out of range."""
@@ -38,7 +40,7 @@ class Material:
 
 
 #: Field -> (lowest, highest) accepted value; also the ranges of the ROS parameters.
-RANGES = limits_of(Material)
+RANGES = {name: limits for name, limits in limits_of(Material).items() if name != "color"}
 
 #: The packaged liquids at 20 degrees centigrade. Adhesion is what Young & Dupre make of the contact
 #: angle on ordinary plastic or glass: (1 + cos angle) / 2, so 0.5 stands for 90 degrees and 0.1 for
@@ -56,6 +58,7 @@ MATERIALS = {
             wall_friction=0.5,
             adhesion=0.9,
             quadratic_viscosity=0.3,
+            color=(0.8, 0.68, 0.15),
         ),
         Material(
             "honey",
@@ -66,6 +69,7 @@ MATERIALS = {
             wall_friction=1.0,
             adhesion=0.8,
             quadratic_viscosity=0.3,
+            color=(0.82, 0.5, 0.08),
         ),
         Material(
             "cream",
@@ -76,6 +80,7 @@ MATERIALS = {
             wall_friction=0.9,
             adhesion=0.8,
             quadratic_viscosity=0.3,
+            color=(0.97, 0.94, 0.86),
         ),
         Material(
             "mercury",
@@ -86,6 +91,7 @@ MATERIALS = {
             wall_friction=0.0,
             adhesion=0.1,
             quadratic_viscosity=0.3,
+            color=(0.72, 0.74, 0.77),
         ),
         # Not a gas, it keeps its volume; but light, without viscosity, tension or grip. Game
         # fluids of the 2000s that left the viscosity out behaved like this.

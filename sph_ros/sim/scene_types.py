@@ -175,6 +175,7 @@ class SolidSpec:
         restitution: share of the speed that is left when a free solid bounces; the larger of two.
         color: red, green, blue, 0 to 1; chosen by whoever draws unless given.
         visible: drawn or not; it acts on the liquid either way.
+        see_through: drawn as outlines, like glass, for what is in or behind it.
     """
 
     name: str
@@ -190,6 +191,7 @@ class SolidSpec:
     restitution: float = quantity("1", 0.0, low=0.0, high=1.0)
     color: Vector | None = quantity("1", None, low=0.0, high=1.0)
     visible: bool = True
+    see_through: bool = False
 
     def __post_init__(self):
         """Refuse bad names, and keyframes that do not fit the control."""
@@ -200,8 +202,9 @@ class SolidSpec:
             )
         if self.control not in CONTROLS:
             raise ValueError(f"control: expected one of {CONTROLS}, got {self.control!r}")
-        if not isinstance(self.visible, bool):
-            raise ValueError(f"visible: expected true or false, got {self.visible!r}")
+        for key in ("visible", "see_through"):
+            if not isinstance(getattr(self, key), bool):
+                raise ValueError(f"{key}: expected true or false, got {getattr(self, key)!r}")
         check_quantities(self)
         self._check_path()
         self._check_body()
@@ -264,6 +267,7 @@ class Scene:
         max_solid_speed: solids sweep towards their poses no faster than this [m/s].
         source: file the scene came from, or "<dict>".
         description: for people.
+        duration: how long `sph_ros simulate` runs unless told [s]; None: 5.
     """
 
     name: str
@@ -283,6 +287,7 @@ class Scene:
     max_solid_speed: float = quantity("m/s", 3.0, above=0.0, high=100.0)
     source: str = "<dict>"
     description: str = ""
+    duration: float | None = quantity("s", None, above=0.0, high=1e6)
 
     def __post_init__(self):
         """Refuse what does not fit together."""

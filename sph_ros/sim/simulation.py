@@ -367,13 +367,14 @@ class Simulation:
 
         Returns:
             dict with time [s], particle_count, mean_compression and max_compression (density above
-            rest over rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], max_speed [m/s],
-            emitted_particles and removed_particles (by sinks) since the start, lost_particles
-            (those outside a container or no longer finite, and those that were removed because they
-            got far away from everything), squeezed_particles (rescued from between solids in the
-            last step), substeps and iterations of the last step, density_error (mean, left by the
-            last iteration, -), solid_momentum (3,) [kg m/s] and solid_energy (kinetic, [J]) of the
-            free solids. In 2D energies and momenta are per metre of depth.
+            rest over rest density, -), kinetic_energy [J], momentum (3,) [kg m/s], mean_speed and
+            max_speed [m/s], emitted_particles and removed_particles (by sinks) since the start,
+            lost_particles (those outside a container or no longer finite, and those that were
+            removed because they got far away from everything), squeezed_particles (rescued from
+            between solids in the last step), substeps and iterations of the last step,
+            density_error (mean, left by the last iteration, -), solid_momentum (3,) [kg m/s] and
+            solid_energy (kinetic, [J]) of the free solids. In 2D energies and momenta are per metre
+            of depth.
         """
         velocities = self._fluid.velocities.astype(np.float64)
         mass = self._solver.scales.mass
@@ -387,6 +388,7 @@ class Simulation:
             "max_compression": float(excess.max(initial=0.0)),
             "kinetic_energy": 0.5 * mass * float(square.sum()),
             "momentum": mass * velocities.sum(axis=0),
+            "mean_speed": float(np.sqrt(square).mean()) if len(square) else 0.0,
             "max_speed": math.sqrt(float(square.max(initial=0.0))),
             "emitted_particles": self._emitters.emitted,
             "removed_particles": self._sinks.removed,
