@@ -89,11 +89,9 @@ def test_momentum_goes_back_and_forth_between_liquid_and_body(solver):
         sim.step()
         given = max(given, np.linalg.norm(cube.momentum[0] - size * np.array([-1, 0, 0])))
         now, _ = momenta()
-        print(np.abs(now - linear).max())
         np.testing.assert_allclose(now, linear, atol=1e-5 * np.linalg.norm(linear))
     assert given > 0.5 * size
     assert sim.statistics()["squeezed_particles"] == 0
-    print(momenta()[1], angular)
     if solver == "incompressible":
         np.testing.assert_allclose(momenta()[1], angular, atol=1e-3 * 0.2 * size)
 
@@ -123,17 +121,16 @@ def test_balls_float_as_deep_as_archimedes_says_or_sink():
     volume = 4 / 3 * math.pi * radius**3
     displaced = volume * sum(min(density / 1000, 1.0) for density in places)
     level = (sim.particle_count * spacing**3 + displaced) / (length * width)
-    sim.advance(2.5)
+    sim.advance(2.0)
     for density in (500.0, 900.0):
         draft = brentq(lambda x, d=density: submerged(x) - d / 1000, 0, 1) * 2 * radius
         height = sim.solid(f"ball{density:.0f}").position[2]
-        print(density, height, level - draft + radius, (height - (level - draft + radius)) / 0.12)
         assert height == pytest.approx(level - draft + radius, abs=0.05 * 2 * radius)
-    sunk = sim.solid("ball2000")
-    print(sunk.position, sunk.velocity, sim.particle_count)
-    assert sunk.position[2] == pytest.approx(radius, abs=0.02 * radius)
-    assert abs(sunk.velocity[2]) < 1e-3
-    force, _ = sim.wrench("ball500")
+    heights = []  # what still sloshes may roll the sunken ball, but not lift it
+    for _ in range(20):
+        sim.step()
+        heights.append(sim.solid("ball2000").position[2])
+    np.testing.assert_allclose(heights, radius, atol=0.01 * radius)
     assert sim.statistics()["lost_particles"] == 0
 
 
@@ -162,13 +159,12 @@ def test_a_heavy_box_under_water_stays_where_it_lies(solver):
             ],
         }
     )
-    sim.advance(1.0)
+    sim.advance(0.6)
     box = sim.solid("box")
     moved = []
-    for _ in range(50):
+    for _ in range(20):
         sim.step()
         moved.append([*box.velocity, *box.angular_velocity])
-    print(box.position, box.quat_xyzw, np.abs(moved).max(axis=0))
     assert box.position == pytest.approx([0.25, 0, 0.05], abs=0.002)
     assert box.position[1] == 0.0 and box.quat_xyzw[[0, 2]] == pytest.approx([0, 0], abs=0)
     assert np.abs(moved).max() < 0.01
@@ -206,7 +202,6 @@ def test_a_body_much_lighter_than_honey_settles(solver):
     assert np.linalg.norm(block.velocity) < 0.05
     assert 0.1 < block.position[2] < 0.16
     turned = 2 * math.asin(min(np.linalg.norm(block.quat_xyzw[:2]), 1.0))
-    print(fastest, block.velocity, block.position, turned)
     assert turned < 0.12
 
 
@@ -267,7 +262,7 @@ def boat_scene(filled):
         for block in scene.liquid
     ]
     if filled:
-        liquid.append({"box": {"min": [0.2, 0.13, 0.11], "max": [0.34, 0.23, 0.19]}})
+        liquid.append({"box": {"min": [0.14, 0.12, 0.1], "max": [0.32, 0.24, 0.2]}})
     file = ROOT / "scenes" / "meshes" / "boat.ply"
     boat = {
         "name": "boat",
@@ -291,17 +286,10 @@ def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled
     draft = brentq(lambda z: boat_module.displaced(z)[0] * 1000 - 1250 * hull.volume, 0.02, 0.09)
     sim = sph_ros.Simulation(boat_scene(filled=False))
     boat, heights = sim.solid("boat"), []
-    while sim.time < 2.5:
+    while sim.time < 1.8:
         sim.step()
         heights.append(boat.position[2])
-        if len(heights) % 20 == 0:
-            print(
-                round(sim.time, 2),
-                boat.position.round(4),
-                np.degrees(heel_and_trim(boat.quat_xyzw)).round(2),
-            )
     level = (sim.particle_count * 0.02**3 + 1.25 * hull.volume) / (0.6 * 0.36)
-    print("keel", boat.position[2], "truth", level - draft, "level", level)
     turns = np.flatnonzero(np.diff(np.sign(np.diff(heights))))
     assert len(turns) >= 3  # up and down
     heel, trim = heel_and_trim(boat.quat_xyzw)
@@ -310,16 +298,9 @@ def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled
     assert np.linalg.norm(boat.velocity) < 0.05
 
     sim = sph_ros.Simulation(boat_scene(filled=True))
-    while sim.time < 3.0:
+    while sim.time < 1.8:
         sim.step()
-        boat = sim.solid("boat")
-        if round(sim.time / sim.time_step) % 20 == 0:
-            print(
-                round(sim.time, 2),
-                boat.position.round(4),
-                np.degrees(heel_and_trim(boat.quat_xyzw)).round(2),
-            )
-    assert sim.solid("boat").position[2] < 0.02
+    assert sim.solid("boat").position[2] < 0.01
     assert sim.statistics()["lost_particles"] == 0
 
 

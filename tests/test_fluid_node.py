@@ -50,6 +50,11 @@ solids:
     sphere: {radius: 0.025}
     pose: {position: [0.06, 0.06, 0.16]}
     control: topic
+  - name: cork
+    sphere: {radius: 0.015}
+    pose: {position: [0.02, 0.02, 0.11]}
+    control: free
+    density: 250
 """
 
 
@@ -179,8 +184,10 @@ def test_one_pose_is_one_publication_and_equals_the_simulation(fresh, scene_path
         heard = cdr_to_wrench(fresh.wrenches[step])
         assert heard[:2] == cloud.header
         assert np.allclose(heard.force + heard.torque, wrench, rtol=1e-12, atol=1e-12)
-        ball = cdr_to_markers(fresh.solids[step])[1]
+        _, ball, cork = cdr_to_markers(fresh.solids[step])
         assert ball.namespace == "ball" and np.allclose(ball.position, position, atol=1e-6)
+        assert np.array_equal(cork.position, sim.solid("cork").position)
+        assert np.array_equal(cork.quat_xyzw, sim.solid("cork").quat_xyzw)
     assert np.linalg.norm(wrench[:3]) > 1e-3  # the ball is in the water by now
     assert len(fresh.particles) == len(fresh.wrenches) == 20
 
@@ -242,6 +249,24 @@ def test_bad_poses_are_refused_counted_and_survived(fresh):
     fresh.ros.wait_for(lambda: len(fresh.solids) == len(fresh.particles))
     turned = cdr_to_markers(fresh.solids[-1])[1].quat_xyzw
     assert np.allclose(turned, np.array([0, 0, 0.7, 0.72]) / math.hypot(0.7, 0.72), atol=1e-6)
+
+
+def test_poses_of_a_free_solid_are_refused_in_words(fresh):
+    hand = fresh.ros.node.create_publisher(PoseStamped, "/fluid/solids/cork/pose", 1)
+
+    def refusal():
+        found = [
+            s for array in fresh.reports for s in array.status if s.name == "fluid: solid cork"
+        ]
+        return found and found[-1].message
+
+    try:
+        fresh.ros.wait_for(refusal, what="for the refusal")
+        assert "poses refused: it is free" in refusal()
+        assert "cork: poses refused: it is free" in fresh.program.output
+        assert hand.get_subscription_count() == 0  # nobody offers it for dragging
+    finally:
+        fresh.ros.node.destroy_publisher(hand)
 
 
 def test_parameters_are_described_ranged_and_live(fresh):
