@@ -262,34 +262,34 @@ def boat_scene(filled):
         for block in scene.liquid
     ]
     if filled:
-        liquid.append({"box": {"min": [0.14, 0.12, 0.1], "max": [0.32, 0.24, 0.2]}})
+        liquid.append({"box": {"min": [0.13, 0.09, 0.16], "max": [0.31, 0.21, 0.26]}})
     file = ROOT / "scenes" / "meshes" / "boat.ply"
     boat = {
         "name": "boat",
         "mesh": {"file": str(file)},
-        "pose": {"position": [0.28, 0.18, 0.076], "quat_xyzw": [0.06, 0, 0, 1]},
+        "pose": {"position": [0.27, 0.15, 0.136], "quat_xyzw": [0.06, 0, 0, 1]},
         "control": "free",
-        "density": 1250.0,
+        "density": 1450.0,
     }
     return {
         "spacing": 0.02,
         "solver": "incompressible",
         "material": "water",
         "liquid": liquid,
-        "solids": [tank([0.6, 0.36, 0.5]), boat],
+        "solids": [tank([0.525, 0.3, 0.5]), boat],
     }
 
 
 def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled():
     boat_module = make_boat()
     hull = boat_module.hull()
-    draft = brentq(lambda z: boat_module.displaced(z)[0] * 1000 - 1250 * hull.volume, 0.02, 0.09)
+    draft = brentq(lambda z: boat_module.displaced(z)[0] * 1000 - 1450 * hull.volume, 0.02, 0.09)
     sim = sph_ros.Simulation(boat_scene(filled=False))
     boat, heights = sim.solid("boat"), []
     while sim.time < 1.8:
         sim.step()
         heights.append(boat.position[2])
-    level = (sim.particle_count * 0.02**3 + 1.25 * hull.volume) / (0.6 * 0.36)
+    level = (sim.particle_count * 0.02**3 + 1.45 * hull.volume) / (0.525 * 0.3)
     turns = np.flatnonzero(np.diff(np.sign(np.diff(heights))))
     assert len(turns) >= 3  # up and down
     heel, trim = heel_and_trim(boat.quat_xyzw)
@@ -300,7 +300,8 @@ def test_the_boat_bobs_floats_upright_as_deep_as_it_should_and_sinks_when_filled
     sim = sph_ros.Simulation(boat_scene(filled=True))
     while sim.time < 1.8:
         sim.step()
-    assert sim.solid("boat").position[2] < 0.01
+    keel = sim.solid("boat").position[2]
+    assert keel < 0.02 and keel + boat_module.DEPTH < level - 0.05  # on the floor, under water
     assert sim.statistics()["lost_particles"] == 0
 
 

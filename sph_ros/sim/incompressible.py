@@ -10,7 +10,7 @@ from sph_ros.core import projection as project
 from sph_ros.core import relaxation as relax
 from sph_ros.sim.pressure import Goal
 from sph_ros.sim.pressure_solver import PressureSolver
-from sph_ros.sim.scales import expected_speed, packing, viscous_rate
+from sph_ros.sim.scales import MELTING_TIME, expected_speed, packing, viscous_rate
 
 #: Share of the support radius that the fastest expected particle crosses in a step.
 COURANT = 0.6
@@ -82,7 +82,10 @@ class IncompressibleSolver(PressureSolver):
         # fills a closed container, the rest density stays that of the lattice.
         exposed = np.count_nonzero(work.sums.density < SURFACE_DENSITY)
         if exposed > SURFACE_SHARE * len(fluid):
-            self._packing = packing(self._scene, time + time_step)
+            # Where it got room late, no faster than it melts: all at once it would leap.
+            most = packing(self._scene, MELTING_TIME) - packing(self._scene, 0.0)
+            grown = self._packing + most * time_step / MELTING_TIME
+            self._packing = min(packing(self._scene, time + time_step), grown)
         if self._scene.emitters or self._scene.sinks:
             self._listed = None  # particles may come and go before the next step
         else:
