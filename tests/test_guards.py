@@ -26,8 +26,16 @@ TANK = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("name", ["velocities", "positions", "pressures"])
+#: Arrays that the next step depends on; `forces` reckons its pressures anew.
+STATE = [
+    (name, solver)
+    for name in ("velocities", "positions", "pressures")
+    for solver in SOLVERS
+    if (name, solver) != ("pressures", "forces")
+]
+
+
+@pytest.mark.parametrize(("name", "solver"), STATE)
 def test_the_first_nan_stops_with_step_particle_cause_and_the_state_before(
     name, solver, tmp_path, monkeypatch
 ):

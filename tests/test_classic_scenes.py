@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The classic systems end as they should; coarser and shorter than packaged, to be quick."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+import sph_ros
+from sph_ros.dam_house import Case, run_case, with_wall
+from sph_ros.sim.scene import load_scene, scene_path
+
+
+def described(name, **changes):
+    """A packaged scene as a dict, with changes; its mesh files are found from anywhere."""
+    path = scene_path(name)
+    scene = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for solid in scene["solids"] if "solids" in scene else []:
+        for kind in ("mesh", "surface"):
+            if kind in solid:
+                solid[kind]["file"] = str(path.parent / solid[kind]["file"])
+    return {**scene, **changes}
+
+
+def test_a_glass_is_filled_and_nothing_is_spilled():
+    scene = described("pour_glass", spacing=0.006)
+    count = 926  # as much water as 5,000 particles of the packaged scene
+    scene["emitters"][0]["limit"] = count
+    sim = sph_ros.Simulation(scene)
+    force = []
+    while sim.time < 3.0:
+        sim.step()
+        force.append(sim.wrench("glass")[0][2])
+    facts = sim.statistics()
+    assert facts["particle_count"] == facts["emitted_particles"] == count
+    radius, base, volume = 0.032, 0.01, count * 0.006**3
+    assert np.hypot(*sim.positions[:, :2].T).max() < radius and sim.positions[:, 2].min() > base
+    level = base + volume / (math.pi * radius**2)
+    assert np.percentile(sim.positions[:, 2], 97) == pytest.approx(level, abs=0.006)
+    assert np.mean(force[-100:]) == pytest.approx(-1000 * volume * 9.81, rel=0.02)
+    assert facts["mean_speed"] < 0.02
+
+
+def test_two_drops_become_one_that_is_round():
+    sim = sph_ros.Simulation(described("drops_merge", spacing=0.0025, support_radius=0.007))
+    sim.advance(3.0)
+    positions = sim.positions.astype(np.float64)
+    near = cKDTree(positions).query_pairs(1.5 * 0.0025, output_type="ndarray")
+    links = coo_array((np.ones(len(near)), near.T), shape=(len(positions),) * 2)
+    assert connected_components(links, directed=False)[0] == 1
+    centred = positions - positions.mean(axis=0)
+    spread = np.linalg.eigvalsh(centred.T @ centred)
+    assert math.sqrt(spread[0] / spread[2]) > 0.9  # two drops side by side: 0.45
+    mass = len(positions) * 1000 * 0.0025**3
+    assert np.linalg.norm(sim.statistics()["momentum"]) < 1e-4 * mass * 0.02
+
+
+def test_rain_fills_its_container_and_settles():
+    scene = described("rain_2d")
+    scene["emitters"][0].update(position=[0.1, 0, 1.2], radius=0.09, limit=200)
+    scene["solids"][0]["container"]["box"].update(min=[0, -0.05, 0], max=[0.2, 0.05, 1.3])
+    sim = sph_ros.Simulation(scene)
+    sim.advance(2.0)
+    raining = sim.statistics()
+    assert raining["emitted_particles"] == pytest.approx(100, abs=2)  # 50 a second
+    sim.advance(4.0)
+    settled = sim.statistics()
+    assert settled["emitted_particles"] == settled["particle_count"] == 200
+    assert settled["lost_particles"] == 0
+    assert settled["mean_speed"] < 0.1 * raining["mean_speed"]
+    depth = 200 * 0.0105**2 / 0.2
+    assert sim.positions[:, 2].max() + 0.5 * 0.0105 == pytest.approx(depth, rel=0.1)
+
+
+def test_a_column_comes_over_the_wall_and_the_basin_holds_what_fits():
+    """2 m^2 stay behind the wall of 1 m, 3 m^2 come over it and reach the house."""
+    basin = described("dam_house_2d")
+    basin["liquid"][0]["box"]["max"][2] = 1.0
+    sim = sph_ros.Simulation(basin)
+    assert sim.particle_count == 200
+    while sim.time < 4.0:
+        sim.step()
+        assert sim.positions[:, 0].max() < 2.0
+    assert sph_ros.Simulation("dam_house_2d").particle_count == 300
+    flood = run_case(Case(2.0, 1.0, seconds=4.0))
+    # What stands above the wall, half of 2 m x 1.5 m at most, goes over it.
+    assert 0.5 < flood.past < 1.05 and flood.wet_from < 3.0
+    dry = run_case(Case(2.0, 2.2, seconds=4.0))
+    assert dry.dry and dry.past == 0.0 and dry.reached < 2.0
+
+
+def test_walls_of_the_study_are_where_they_are_asked_for():
+    scene = with_wall(load_scene("dam_house_2d"), 3.0, 1.7)
+    wall = next(solid for solid in scene.solids if solid.name == "wall")
+    assert wall.shape.min == (3.0, -0.3, 0.0) and wall.shape.max == pytest.approx((3.1, 0.3, 1.7))
+    assert [solid.name for solid in scene.solids] == ["basin", "wall", "house"]
+
+
+def test_stirred_liquid_goes_round_with_the_stirrer_and_stays_in_the_cup():
+    sim = sph_ros.Simulation(described("stirred_cup", spacing=0.005))
+    count = sim.particle_count
+    sim.advance(2.0)  # five turns
+    x, y, z = sim.positions.astype(np.float64).T
+    u, v, _ = sim.velocities.astype(np.float64).T
+    r = np.hypot(x, y)
+    spin = (x * v - y * u)[r > 0.01] / r[r > 0.01] ** 2
+    stirrer = 2 * math.pi / 0.35
+    assert 0.3 * stirrer < spin.mean() < stirrer
+    assert sim.particle_count == count and z.min() > 0.0 and r.max() < 0.043
+    # The surface is higher at the rim than in the middle.
+    outside, inside = z[r > 0.03], z[r < 0.012]
+    assert np.percentile(outside, 98) > np.percentile(inside, 98)
