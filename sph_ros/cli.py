@@ -46,9 +46,10 @@ def _user_errors():
     from sph_ros.tracking.commands import CommandError
     from sph_ros.tracking.detection import DictionaryError
     from sph_ros.tracking.targets import TargetError
+    from sph_ros.validation.options import ValidateError
 
     tracking = CalibrationError, CommandError, DictionaryError, TargetError
-    return SceneError, BagError, SimulateError, UnstableError, *tracking
+    return SceneError, BagError, SimulateError, UnstableError, ValidateError, *tracking
 
 
 def _parser():
@@ -71,6 +72,7 @@ def _parser():
     _add_simulate(commands)
     _add_study(commands)
     _add_tracking(commands)
+    _add_validate(commands)
     return parser
 
 
@@ -130,6 +132,12 @@ def _add_tracking(commands):
 
     add_markers(commands)
     add_calibrate(commands)
+
+
+def _add_validate(commands):
+    from sph_ros.validation.options import add_validate
+
+    add_validate(commands)
 
 
 # ---------------------------------------------------------------- subcommands

@@ -11,6 +11,7 @@ from sph_ros.sim.coupling import Coupling
 from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
 from sph_ros.sim.scales import packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
+from sph_ros.sim.stress import Weights, virial_pressures, walls_share
 from sph_ros.sim.viscosity import Rates, apply_viscosity
 
 #: For the part of the push on solids that is pressure alone.
@@ -52,19 +53,28 @@ class PressureSolver(Solver):
         self._share, self._packing = state["share"], state["packing"]
 
     def pressures(self, fluid):
-        """Pressures of the last substep [Pa], (N,) float32, rows as in `fluid`.
-
-        That of the density and those that make surface tension, p + Kc (density - 1) + Kn
-        (near_density - 1): in the bulk, the virial of all pairs (see `scales`).
-        """
+        """Pressures of the last substep [Pa], (N,) float32, rows as in `fluid`."""
         if self._listed is not fluid or self._work.count != len(fluid):
             twin = fluid.copy()
             self._make_lists(twin)
             self._sum_densities()
             return twin.public(self.pressures(twin))[fluid.particle]
-        sums, scales = self._work.sums, self.scales
-        cohesive = scales.cohesion * (sums.density - 1.0) + scales.near * (sums.near_density - 1.0)
-        return fluid.pressures + cohesive.astype(np.float32)
+        sums, scales, scene = self._work.sums, self.scales, self._scene
+        weights = Weights(
+            float(self._h),
+            DENSITY_POWER * scales.density_scale * self._packing / float(self._h),
+            self._near_ratio(),
+            scales.virial * self._packing,
+            walls_share(scene.support_radius, scene.spacing, scene.dimension),
+            scene.dimension,
+        )
+        tension = scales.cohesion * (sums.density - 1.0) - scales.near
+        near = scales.near * scales.near_virial_ratio * self._packing * sums.near_density
+        return virial_pressures(self._work, weights, fluid.pressures + tension, near)
+
+    def _near_ratio(self):
+        """Near gradient per gradient and (1 - r/h) of a pair [-]."""
+        return 1.5 * self.scales.near_scale / (self.scales.density_scale * self._packing)
 
     def stages(self):
         """What the last substep made, in order."""
@@ -98,13 +108,12 @@ class PressureSolver(Solver):
         """Displacements by surface tension, into `cohesive`, and the reactions to them."""
         work, scales = self._work, self.scales
         if scales.cohesion > 0.0:
-            ratio = 1.5 * scales.near_scale / (scales.density_scale * self._packing)
             relax.cohesive_displacements(
                 work.pairs,
                 work.sums,
                 work.contacts.gradients,
                 tension,
-                np.float32(ratio),
+                np.float32(self._near_ratio()),
                 work.cohesive,
             )
             work.guesses[:] = 0.0
