@@ -75,8 +75,7 @@ def chosen(names):
     """
     for name in names:
         if name not in CHECKS:
-            hint = nearest(name, CHECKS)
-            raise ValidateError(f"no check {name!r}{hint}; there are {', '.join(CHECKS)}")
+            raise ValidateError(f"no check {name!r}{nearest(name, CHECKS)}")
     return [name for name in CHECKS if not names or name in names]
 
 

@@ -33,6 +33,9 @@ def validate(options):
         return 0
     names = chosen(options.names)
     solvers = list(SOLVERS) if options.solver == "all" else [options.solver]
+    if solvers[0] not in SOLVERS:
+        known = ", ".join(SOLVERS)
+        raise ValidateError(f"--solver: expected all or one of {known}; got {options.solver!r}")
     data = None if options.data is None else _readable(options.data)
     folder = _writable(options.out)
     outcomes, complete = _run(names, solvers, options.quick, data)

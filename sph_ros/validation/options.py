@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of `sph_ros validate`; what it needs to run is imported when it runs."""
 
-from sph_ros.sim.scene_types import SOLVERS
-
 #: Solvers that have to pass every check.
 REQUIRED = ("incompressible",)
 
@@ -22,12 +20,7 @@ def add_validate(commands):
     add = parser.add_argument
     add("names", nargs="*", metavar="NAME", help="checks to run; default: all, see --list")
     add("--list", action="store_true", help="name all checks and stop")
-    add(
-        "--solver",
-        choices=[*SOLVERS, "all"],
-        default="all",
-        help="one solver, or all of them (default)",
-    )
+    add("--solver", default="all", metavar="SOLVER", help="name of a solver, or all (default)")
     add("--quick", action="store_true", help="the short form: fewer particles, shorter times")
     add("--out", metavar="DIR", default="out/validate", help="for plots (default: out/validate)")
     add("--data", metavar="FILE", help="published points T,Z of a dam break, instead of a curve")
