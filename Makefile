@@ -62,13 +62,18 @@ bench: $(READY)
 	  echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit 1; \
 	done
 
-# The pictures of the README, last frames of offline runs; takes minutes.
+# The pictures of the README: last frames of offline runs, and the webcam's film; takes minutes.
 pictures: $(READY)
 	$(BIN)/sph_ros simulate ball_tank_large --bag hand_stir --seconds 17.1 --fps 10 --out out/ball_tank --force
 	$(BIN)/sph_ros simulate drop_box --bag hand_push --seconds 0.95 --fps 20 --out out/drop_box --force
 	$(BIN)/sph_ros simulate dam_break --seconds 0.5 --fps 20 --out out/dam_break --force
 	mkdir -p docs
 	for scene in ball_tank drop_box dam_break; do cp out/$$scene/last.png docs/$$scene.png || exit 1; done
+	$(BIN)/sph_ros webcam --make-video out/desk.mp4
+	$(BIN)/sph_ros webcam --source out/desk.mp4 --headless --rate 0.25 --out out/webcam --force
+	"$$($(BIN)/python -c 'import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())')" -y -loglevel error \
+	  -ss 1 -t 9 -i out/webcam/webcam.mp4 -vf fps=12,scale=480:-1:flags=lanczos \
+	  -c:v libwebp_anim -quality 55 -compression_level 6 -loop 0 docs/webcam.webp
 
 clean:
 	rm -rf $(VENV) build install log out *.egg-info .pytest_cache .ruff_cache

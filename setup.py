@@ -76,6 +76,7 @@ setup(
             "fluid_node = sph_ros.nodes.fluid_node:main",
             "bag_player = sph_ros.nodes.bag_player:main",
             "marker_tracker = sph_ros.nodes.marker_tracker:main",
+            "ar_overlay = sph_ros.nodes.ar_overlay:main",
             "web_viewer = sph_ros.nodes.web_viewer:main",
             "sph_ros = sph_ros.cli:main",
         ],

@@ -22,6 +22,10 @@ def main(argv=None):
         from sph_ros.demo import main as demo
 
         return demo(argv[1:])
+    if argv[:1] == ["webcam"]:
+        from sph_ros.webcam import main as webcam
+
+        return webcam(argv[1:])
     options = _parser().parse_args(argv)
     try:
         return options.run(options)
@@ -69,6 +73,7 @@ def _parser():
     commands.add_parser(
         "demo", help="the node, a recorded hand and a live view at once", add_help=False
     )
+    commands.add_parser("webcam", help="water on your desk, in a camera's picture", add_help=False)
     _add_simulate(commands)
     _add_study(commands)
     _add_tracking(commands)

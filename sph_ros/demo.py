@@ -7,8 +7,6 @@ on a robot. This process only watches them.
 
 import argparse
 import os
-import shutil
-import signal
 import sys
 import time
 from contextlib import ExitStack
@@ -16,6 +14,14 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from sph_ros.live import (
+    LiveError,
+    check_target,
+    remove_old,
+    run_program,
+    start_fluid,
+    watch_until_stopped,
+)
 from sph_ros.options import positive
 from sph_ros.processes import ChildError, Children
 
@@ -32,42 +38,11 @@ VIDEO_SIZE = (960, 720)
 RESULTS = ("bag", "demo.mp4", "last.png")
 
 
-class DemoError(ValueError):
-    """The demo cannot start; one line that says why."""
-
-
-class _Stopped(BaseException):
-    """SIGINT or SIGTERM came."""
-
-
 def main(argv=None):
     """Run the demo; returns the exit status: Ctrl-C gives 0 in the live demo, else 130."""
     options = _parse(sys.argv[1:] if argv is None else list(argv))
-    # Nobody else's topics, and nothing on the network, unless the environment says so.
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        return _run(options)
-    except _Stopped:
-        print()
-        if options.headless:
-            print("sph_ros demo: interrupted, nothing was written", file=sys.stderr)
-            return 130
-        return 0
-    except (*_user_errors(), DemoError, ChildError, OSError) as error:
-        print(f"sph_ros demo: {error}", file=sys.stderr)
-        return 1
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _stop(_number, _frame):
-    # Once: a second Ctrl-C must not cut the cleaning up short.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise _Stopped
+    errors = (*_user_errors(), ChildError)
+    return run_program("sph_ros demo", lambda: _run(options), errors, options.headless)
 
 
 def _user_errors():
@@ -124,7 +99,7 @@ def _hand(scene, bag):
     controlled = [solid.name for solid in scene.solids if solid.control == "topic"]
     if not controlled:
         if bag is not None:
-            raise DemoError(f"--bag: no solid of {scene.source} has `control: topic`")
+            raise LiveError(f"--bag: no solid of {scene.source} has `control: topic`")
         return None
     path = bag_path(bag or HANDS.get(scene.name, DEFAULT_HAND))
     with open_bag(path) as reader:
@@ -142,42 +117,13 @@ def _show(options, hand):
 
     with Children() as children, Recorder() as watch:
         children.start("web_viewer", "sph_ros.nodes.web_viewer", "--port", str(options.port))
-        _start_fluid(children, watch, options)
+        start_fluid(children, watch, options.scene)
         if hand is not None:
             _start_hand(children, hand, options)
         print(f"open http://localhost:{options.port} in a browser; Ctrl-C ends the demo")
         print(f"topics: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} ros2 topic list", flush=True)
-        end = time.monotonic() + (options.seconds or float("inf"))
-        with tqdm(bar_format="{desc}", disable=None) as line:
-            while time.monotonic() < end:
-                watch.spin(0.1)
-                children.check()
-                line.set_description_str(_state(watch.facts))
+        watch_until_stopped(children, watch, options.seconds)
         return 0
-
-
-def _state(facts):
-    if not facts:
-        return "waiting for the first report"
-    return (
-        f"{facts['state']}: {float(facts['simulated_time']):.0f} s simulated, "
-        f"{facts['particles']} particles, {float(facts['real_time_factor']):.2f} x real time, "
-        f"{float(facts['step_time_ms']):.1f} ms per step"
-    )
-
-
-def _start_fluid(children, watch, options, *parameters):
-    """Start the fluid node and wait until it has compiled."""
-    arguments = [text for p in (f"scene:={options.scene}", *parameters) for text in ("-p", p)]
-    children.start("fluid_node", "sph_ros.nodes.fluid_node", "--ros-args", *arguments)
-    begin = time.monotonic()
-    with tqdm(bar_format="{desc}", disable=None, leave=False) as line:
-        while not watch.fluid_is_ready:
-            watch.spin(0.1)
-            children.check()
-            seconds = time.monotonic() - begin
-            what = "compiling, first run only" if seconds > 5.0 else "starting"
-            line.set_description_str(f"fluid_node: {what} ... {seconds:.0f} s")
 
 
 def _start_hand(children, hand, options):
@@ -195,13 +141,13 @@ def _record(options, scene, hand):
 
     seconds = options.seconds or DEFAULT_SECONDS
     out = Path(options.out or "out/demo")
-    _check_target(out, options.force)
+    check_target(out, RESULTS, "demo", options.force)
     with ResultFolder(out) as folder:
         bag = folder.path / "bag"
         with BagWriter(bag) as writer:
             factor, count = _record_bag(options, scene, hand, writer, seconds)
         frames = _draw(bag, scene, folder.path)
-        _remove_old(out)
+        remove_old(out, RESULTS)
     print(
         f"{out}: {seconds:g} s recorded, {count} clouds at {factor:.2f} x real time, "
         f"{frames} frames drawn: {', '.join(RESULTS)}"
@@ -216,7 +162,7 @@ def _record_bag(options, scene, hand, writer, seconds):
     with ExitStack() as stack:
         children = stack.enter_context(Children())
         watch = stack.enter_context(Recorder())
-        _start_fluid(children, watch, options)
+        start_fluid(children, watch, options.scene)
         watch.listen(scene)
         _wait_for(children, watch, "/fluid/particles")
         if hand is not None:
@@ -244,7 +190,7 @@ def _wait_for(children, watch, topic):
     deadline = time.monotonic() + MOST_DISCOVERY
     while topic not in watch.counts:
         if time.monotonic() > deadline:
-            raise DemoError(f"nothing on {topic} within {MOST_DISCOVERY:g} s; does DDS work here?")
+            raise LiveError(f"nothing on {topic} within {MOST_DISCOVERY:g} s; does DDS work here?")
         watch.spin(0.05)
         children.check()
 
@@ -261,21 +207,6 @@ def _draw(bag, scene, folder):
 
         video, picture = folder / "demo.mp4", folder / "last.png"
         return film_of_bag(bag, scene, video, picture, VIDEO_SIZE, 30.0, progress)
-
-
-def _check_target(out, force):
-    if out.exists() and not out.is_dir():
-        raise DemoError(f"{out}: is a file, expected a folder to make")
-    if any((out / name).exists() for name in RESULTS) and not force:
-        raise DemoError(f"{out}: holds a demo already; --force replaces it")
-
-
-def _remove_old(out):
-    for path in (out / name for name in RESULTS):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

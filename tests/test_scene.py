@@ -71,6 +71,7 @@ EXPECTED_PARTICLES = {
     "dam_break": (5120, 5120),
     "dam_break_2d": (3200, 3200),
     "dam_house_2d": (300, 300),  # 3 m^2 at 0.1 m
+    "desk_tank": (1536, 1536),
     "drop_box": (2100, 2300),
     "drops_merge": (2700, 3200),
     "floating_boat": (6500, 8500),

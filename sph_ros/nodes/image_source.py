@@ -14,8 +14,14 @@ import numpy as np
 
 from msg_adapters.bags import BagError, open_bag
 from msg_adapters.header import NANOSECONDS
-from msg_adapters.image import COMPRESSED_IMAGE, IMAGE
+from msg_adapters.image import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    cdr_to_compressed_image,
+    cdr_to_image,
+)
 from sph_ros.tracking.camera_message import CAMERA_INFO
+from sph_ros.tracking.images import decode
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
 
@@ -41,6 +47,28 @@ class Encoded(NamedTuple):
 
     type: str
     data: bytes
+
+
+def decoded(thing, color=True):
+    """(pixels, encoding, stamp_ns, frame_id) of a Picture, or of an Image or CompressedImage.
+
+    Args:
+        thing: Picture or Encoded.
+        color: whether colours are wanted; without, what is compressed becomes grey.
+
+    Raises:
+        ValueError: the bytes are not such a message, or cannot be decoded.
+    """
+    if isinstance(thing, Picture):
+        return thing.pixels, "bgr8", thing.stamp_ns, "camera"
+    if thing.type == COMPRESSED_IMAGE:
+        message = cdr_to_compressed_image(thing.data)
+        pixels = decode(message.data, message.format, color)
+        encoding = "bgr8" if color else "mono8"
+    else:
+        message = cdr_to_image(thing.data)
+        pixels, encoding = message.pixels, message.encoding
+    return pixels, encoding, message.header.stamp_ns, message.header.frame_id or "camera"
 
 
 class Source:

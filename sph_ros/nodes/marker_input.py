@@ -38,6 +38,30 @@ class _Unexecuted(CallbackGroup):
         pass
 
 
+def find_topics(node):
+    """Full names of the topics `image`, `compressed` and `camera_info` of a node."""
+    image = node.resolve_topic_name("image")
+    compressed = node.resolve_topic_name("image/compressed")
+    if compressed == node.resolve_topic_name("image/compressed", only_expand=True):
+        compressed = f"{image}/compressed"  # not remapped itself, so it follows the image
+    info = node.resolve_topic_name("camera_info")
+    return {"image": image, "compressed": compressed, "camera_info": info}
+
+
+def acceptable_qos(node, topic):
+    """The best that all publishers of a topic offer: best effort loses large messages."""
+    offered = [one.qos_profile for one in node.get_publishers_info_by_topic(topic)]
+    reliable = all(qos.reliability != ReliabilityPolicy.BEST_EFFORT for qos in offered)
+    # A calibration that was published once and for all is sent to those who ask for it.
+    latched = DurabilityPolicy.TRANSIENT_LOCAL
+    kept = offered and all(qos.durability == latched for qos in offered)
+    return QoSProfile(
+        depth=2,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=latched if kept else DurabilityPolicy.VOLATILE,
+    )
+
+
 class TopicInput:
     """Hears camera_info, and one of the topics of pictures while that is asked for.
 
@@ -72,21 +96,7 @@ class TopicInput:
         for name in self._subscriptions.keys() - wanted:
             self._node.destroy_subscription(self._subscriptions.pop(name))
         for name in wanted:
-            self._subscribe(name, self._acceptable_qos(name))
-
-    def _acceptable_qos(self, name):
-        """The best that all publishers offer: best effort loses large messages."""
-        publishers = self._node.get_publishers_info_by_topic(self._topics[name])
-        offered = [publisher.qos_profile for publisher in publishers]
-        reliable = all(qos.reliability != ReliabilityPolicy.BEST_EFFORT for qos in offered)
-        # A calibration that was published once and for all is sent to those who ask for it.
-        latched = DurabilityPolicy.TRANSIENT_LOCAL
-        kept = offered and all(qos.durability == latched for qos in offered)
-        return QoSProfile(
-            depth=2,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=latched if kept else DurabilityPolicy.VOLATILE,
-        )
+            self._subscribe(name, acceptable_qos(self._node, self._topics[name]))
 
     def _subscribe(self, name, qos):
         """Subscribe to a topic, or once more with another QoS."""

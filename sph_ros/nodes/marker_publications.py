@@ -4,11 +4,12 @@
 import time
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
 from msg_adapters.header import split_stamp
 from msg_adapters.image import image_to_cdr
 from msg_adapters.pose import pose_to_cdr
+from sph_ros.tracking.camera_message import camera_to_cdr
 
 try:
     import tf2_ros
@@ -24,9 +25,10 @@ class MarkerPublications:
         solid_names: names of solids.
         world_frame: name of the world's frame.
         with_tf: whether transforms are sent where tf2_ros is installed.
+        with_pictures: whether pictures and their calibration are sent on.
     """
 
-    def __init__(self, node, solid_names, world_frame, with_tf):
+    def __init__(self, node, solid_names, world_frame, with_tf, with_pictures=False):
         self._node = node
         self._world_frame = world_frame
         self._poses, self._covariances = {}, {}
@@ -38,6 +40,12 @@ class MarkerPublications:
         self._camera = node.create_publisher(PoseStamped, "~/camera_pose", 10)
         self._debug = node.create_publisher(Image, "~/debug_image", 2)
         self._debug_time = -1e9
+        self._pictures = ()
+        if with_pictures:
+            self._pictures = (
+                node.create_publisher(Image, "~/image", 2),
+                node.create_publisher(CameraInfo, "~/camera_info", 2),
+            )
         self._broadcaster = None
         if with_tf and tf2_ros is not None:
             self._broadcaster = tf2_ros.TransformBroadcaster(node)
@@ -46,7 +54,8 @@ class MarkerPublications:
 
     def listeners(self):
         """Number of subscriptions to anything."""
-        publishers = [*self._poses.values(), *self._covariances.values(), self._camera, self._debug]
+        publishers = [*self._poses.values(), *self._covariances.values()]
+        publishers += [self._camera, self._debug, *self._pictures]
         count = sum(publisher.get_subscription_count() for publisher in publishers)
         if self._broadcaster is not None:
             count += self._node.count_subscribers("/tf")
@@ -83,6 +92,16 @@ class MarkerPublications:
             return False
         self._debug_time = now
         return True
+
+    def pictures_wanted(self):
+        """Whether anybody wants the pictures themselves or their calibration."""
+        return any(publisher.get_subscription_count() for publisher in self._pictures)
+
+    def publish_picture(self, pixels, encoding, camera, stamp_ns, frame):
+        """Send a picture on, and its CameraModel before it."""
+        pictures, calibrations = self._pictures
+        calibrations.publish(camera_to_cdr(camera, stamp_ns, frame))
+        pictures.publish(image_to_cdr(pixels, encoding, stamp_ns, frame))
 
     def publish_debug(self, picture, stamp_ns, frame):
         """Send a debug picture (H, W, 3) uint8 BGR."""

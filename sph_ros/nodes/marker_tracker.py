@@ -17,11 +17,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from msg_adapters.image import COMPRESSED_IMAGE, cdr_to_compressed_image, cdr_to_image
-from sph_ros.nodes.image_source import Encoded, Picture, SourceError, make_source
+from msg_adapters.image import COMPRESSED_IMAGE
+from sph_ros.nodes.image_source import Encoded, Picture, SourceError, decoded, make_source
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status, target_status
-from sph_ros.nodes.marker_input import TopicInput
+from sph_ros.nodes.marker_input import TopicInput, find_topics
 from sph_ros.nodes.marker_mailbox import Mailbox
 from sph_ros.nodes.marker_parameters import MEASURED, MarkerParameters, TrackerParameterError
 from sph_ros.nodes.marker_publications import MarkerPublications
@@ -30,7 +30,7 @@ from sph_ros.tracking.camera import CameraError
 from sph_ros.tracking.camera_message import CAMERA_INFO
 from sph_ros.tracking.detection import DictionaryError
 from sph_ros.tracking.drawing import draw_notes, draw_tracking
-from sph_ros.tracking.images import ImageError, decode, to_bgr, to_gray
+from sph_ros.tracking.images import ImageError, to_bgr, to_gray
 from sph_ros.tracking.preparation import prepare
 from sph_ros.tracking.targets import TargetError
 from sph_ros.tracking.tracker import Tracker
@@ -79,9 +79,13 @@ class MarkerTracker(Node):
         self._milliseconds, self._size, self._last_picture = 0.0, "", None
         names = parameters.solid_names()
         self._publications = MarkerPublications(
-            self, names, parameters["world_frame"], parameters["publish_tf"]
+            self,
+            names,
+            parameters["world_frame"],
+            parameters["publish_tf"],
+            with_pictures=bool(parameters.source),
         )
-        self._input_topics = self._find_topics()
+        self._input_topics = find_topics(self)
         from_topics = not parameters.source
         source = None if from_topics else self._make_source()  # a wrong one is noticed at once
         self._calibration = CalibrationChoice(
@@ -111,17 +115,6 @@ class MarkerTracker(Node):
             self._thread.join(timeout=10.0)
         self._stop_source()
         super().destroy_node()
-
-    def _find_topics(self):
-        image = self.resolve_topic_name("image")
-        compressed = self.resolve_topic_name("image/compressed")
-        if compressed == self.resolve_topic_name("image/compressed", only_expand=True):
-            compressed = f"{image}/compressed"  # not remapped itself, so it follows the image
-        return {
-            "image": image,
-            "compressed": compressed,
-            "camera_info": self.resolve_topic_name("camera_info"),
-        }
 
     def _rectified(self):
         kind = self._settings["image_kind"]
@@ -208,13 +201,17 @@ class MarkerTracker(Node):
 
     def _process(self, thing):
         debug = self._publications.debug_due(self._settings["debug_rate"])
-        pixels, encoding, stamp_ns, frame = _decoded(thing, color=debug)
+        shared = self._publications.pictures_wanted()
+        pixels, encoding, stamp_ns, frame = decoded(thing, color=debug or shared)
         stamp_ns = stamp_ns or self.get_clock().now().nanoseconds
         gray = to_gray(pixels, encoding)
         height, width = gray.shape
         self._size = f"{width} x {height} {_format(thing, encoding)}"
         picture = to_bgr(pixels, encoding).copy() if debug else None
         try:
+            if shared:  # with those who draw on the pictures of our own source
+                camera = self._calibration.for_picture(width, height)
+                self._publications.publish_picture(pixels, encoding, camera, stamp_ns, frame)
             self._track(gray, stamp_ns, frame, picture)
         except (CameraError, TargetError, DictionaryError) as error:
             if picture is not None:
@@ -323,20 +320,6 @@ class MarkerTracker(Node):
                 f"problems_{kind.replace(' ', '_')}": n for kind, n in self._problems.counts.items()
             },
         }
-
-
-def _decoded(thing, color):
-    """(pixels, encoding, stamp_ns, frame_id); what is compressed becomes grey unless `color`."""
-    if isinstance(thing, Picture):
-        return thing.pixels, "bgr8", thing.stamp_ns, "camera"
-    if thing.type == COMPRESSED_IMAGE:
-        message = cdr_to_compressed_image(thing.data)
-        pixels = decode(message.data, message.format, color)
-        encoding = "bgr8" if color else "mono8"
-    else:
-        message = cdr_to_image(thing.data)
-        pixels, encoding = message.pixels, message.encoding
-    return pixels, encoding, message.header.stamp_ns, message.header.frame_id or "camera"
 
 
 def _format(thing, encoding):

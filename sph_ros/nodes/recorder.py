@@ -5,7 +5,7 @@ import time
 from functools import partial
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -99,6 +99,7 @@ class Recorder:
     Attributes:
         facts: newest diagnostics of the simulation, key -> text.
         counts: messages heard, topic -> number.
+        alerts: what other nodes complain of at present, name -> text.
     """
 
     def __enter__(self):
@@ -107,7 +108,7 @@ class Recorder:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._topics = TopicRecorder(self._node)
-        self.facts = {}
+        self.facts, self.alerts = {}, {}
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._keep_facts, DEPTH, raw=True
         )
@@ -130,7 +131,15 @@ class Recorder:
     @property
     def fluid_is_ready(self):
         """Whether the fluid node has got past its compilation."""
-        return self._node.count_publishers("/fluid/particles") > 0
+        return self.is_published("/fluid/particles")
+
+    def is_published(self, topic):
+        """Whether somebody publishes a topic."""
+        return self._node.count_publishers(topic) > 0
+
+    def hear(self, message_class, topic, take):
+        """Have `take` called with the CDR bytes of every message of a topic."""
+        self._node.create_subscription(message_class, topic, take, DEPTH, raw=True)
 
     def listen(self, scene):
         """Subscribe to the fluid's messages and the poses it gets, and count them."""
@@ -145,3 +154,7 @@ class Recorder:
         for status in deserialize_message(data, DiagnosticArray).status:
             if status.name == "fluid: simulation":
                 self.facts = {item.key: item.value for item in status.values}
+            elif status.level != DiagnosticStatus.OK:
+                self.alerts[status.name] = status.message
+            else:
+                self.alerts.pop(status.name, None)

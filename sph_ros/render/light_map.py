@@ -9,7 +9,7 @@ brighter.
 
 import numpy as np
 
-from sph_ros.core.jit import device, kernel
+from sph_ros.core.jit import bare, bare_kernel
 from sph_ros.render.optics import LAMP, WATER_INDEX, refract
 
 #: Texels along the longer side of the map.
@@ -19,7 +19,7 @@ TEXELS = 420
 MAX_SAMPLES = 1000
 
 
-def floor_light(surface, solids, particles, radius, floor_z, lower, upper):
+def floor_light(surface, solids, particles, radius, floor_z, lower, upper, texels=TEXELS):
     """Lamp light on the floor around the box lower..upper.
 
     Args:
@@ -30,6 +30,7 @@ def floor_light(surface, solids, particles, radius, floor_z, lower, upper):
         floor_z: height of the floor [m].
         lower: corner of the box that holds everything [m], (3,).
         upper: opposite corner [m], (3,).
+        texels: along the longer side of the map.
 
     Returns:
         Map (nx, ny) float32 with 1 for full light, its origin (2,) [m] and texels per metre.
@@ -39,7 +40,7 @@ def floor_light(surface, solids, particles, radius, floor_z, lower, upper):
     border = 0.15 * max(np.linalg.norm(upper - lower), 1e-3)
     low = np.minimum(lower[:2], lower[:2] + drift) - border
     high = np.maximum(upper[:2], upper[:2] + drift) + border
-    scale = TEXELS / (high - low).max()
+    scale = texels / (high - low).max()
     shape = tuple(np.ceil((high - low) * scale).astype(int) + 2)
     shadow, taken, given = (np.zeros(shape, np.float32) for _ in range(3))
     place = np.array([low[0], low[1], scale, floor_z])
@@ -64,7 +65,7 @@ def _blurred(image):
     return 0.25 * (rows[:, :-2] + rows[:, 2:]) + 0.5 * rows[:, 1:-1]
 
 
-@device
+@bare
 def _deposit(image, place, x, y, area):
     """Add an area [m^2] of light at floor point (x, y), in units of a fully lit texel."""
     u = (x - place[0]) * place[2] - 0.5
@@ -79,7 +80,7 @@ def _deposit(image, place, x, y, area):
         image[i + 1, j + 1] += a * b * amount
 
 
-@device
+@bare
 def _floor_area(points, a, b, c, place):
     """Signed area [m^2] of a triangle's shadow on the floor, positive if lit from outside."""
     sx, sy = LAMP[0] / LAMP[2], LAMP[1] / LAMP[2]
@@ -90,13 +91,13 @@ def _floor_area(points, a, b, c, place):
     return 0.5 * (ux * vy - uy * vx)
 
 
-@device
+@bare
 def _sample_count(area, place):
     """Samples along an edge so that they lie about half a texel apart."""
     return int(min(max(2.0 * np.sqrt(2.0 * area) * place[2], 2.0), MAX_SAMPLES))
 
 
-@kernel
+@bare_kernel
 def _cast_shadow(corners, place, shadow):  # the last is written
     """Shadow of opaque triangles; each is counted from its lit side only."""
     sx, sy = LAMP[0] / LAMP[2], LAMP[1] / LAMP[2]
@@ -118,7 +119,7 @@ def _cast_shadow(corners, place, shadow):  # the last is written
                 _deposit(shadow, place, x - sx * z, y - sy * z, area / (n * n))
 
 
-@kernel
+@bare_kernel
 def _cast_discs(centres, radius, place, shadow):  # the last is written
     """Shadow of small spheres."""
     sx, sy = LAMP[0] / LAMP[2], LAMP[1] / LAMP[2]
@@ -129,7 +130,7 @@ def _cast_discs(centres, radius, place, shadow):  # the last is written
         )
 
 
-@kernel
+@bare_kernel
 def _cast_caustics(vertices, triangles, normals, place, taken, given):  # last two are written
     """Light that the liquid's lit side takes from straight rays and gives along refracted ones."""
     sx, sy = LAMP[0] / LAMP[2], LAMP[1] / LAMP[2]

@@ -13,6 +13,7 @@ from sph_ros.colors import LIQUID, SOLIDS, linear, speed_colors
 from sph_ros.render.camera import Camera
 from sph_ros.render.light_map import floor_light
 from sph_ros.render.raster import (
+    BANDS,
     NEAR,
     draw_lines,
     draw_liquid,
@@ -192,7 +193,7 @@ def _draw_opaque(frame, camera, size, surface):
     shown = [solid for solid in frame.solids if not (solid.container or solid.wireframe)]
     for number, solid in enumerate(shown):
         points = solid.world_vertices()[solid.triangles]
-        corners, normals = projected_corners(points, _corner_normals(points), camera, size)
+        corners, normals = projected_corners(points, corner_normals(points), camera, size)
         colour = SOLIDS[number % len(SOLIDS)] if solid.color is None else solid.color[:3]
         colours = np.tile(np.float32(linear(colour)), (len(corners), 1))
         draw_solids(corners, normals, colours, view, depth, picture)
@@ -206,7 +207,7 @@ def _draw_opaque(frame, camera, size, surface):
     return depth, picture
 
 
-def _corner_normals(points):
+def corner_normals(points):
     """Unit normals at triangles' corners: mean over the faces around, flat across creases.
 
     Args:
@@ -236,7 +237,7 @@ def _draw_liquid(surface, camera, size, solid_depth):
         corners, normals = projected_corners(
             np.asarray(vertices, np.float64)[triangles], normals[triangles], camera, size
         )
-        draw_liquid(corners, normals, solid_depth, front, back, thickness)
+        draw_liquid(corners, normals, solid_depth, BANDS, front, back, thickness)
     return front, back, thickness
 
 
@@ -246,7 +247,7 @@ def _draw_outlines(frame, camera, size, solid_depth, supersample):
     for solid in frame.solids:
         if not (solid.container or solid.wireframe):
             continue
-        ends, near = _outlines(solid, camera)
+        ends, near = Edges(solid.world_vertices(), solid.triangles).seen_from(camera.eye)
         for number, cover in enumerate(covers):
             chosen = ends[near == bool(number)]
             if len(chosen):
@@ -257,30 +258,42 @@ def _draw_outlines(frame, camera, size, solid_depth, supersample):
     return covers[0], covers[1]
 
 
-def _outlines(solid, camera):
-    """Ends of creases, silhouettes and open edges (L, 2, 3) [m]; which are on the camera's side."""
-    points = solid.world_vertices()
-    triangles = np.asarray(solid.triangles, np.int64)
-    _, first, same = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
-    triangles = first[same.reshape(-1)][triangles]
-    faces = np.cross(
-        points[triangles[:, 1]] - points[triangles[:, 0]],
-        points[triangles[:, 2]] - points[triangles[:, 0]],
-    )
-    faces /= np.maximum(np.linalg.norm(faces, axis=1), 1e-30)[:, None]
-    seen = np.einsum("ij,ij->i", faces, camera.eye - points[triangles[:, 0]]) > 0.0
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(triangles)), 3)
-    order = np.lexsort(edges.T)
-    edges, owner = edges[order], owner[order]
-    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    one, other = owner[pair], owner[pair + 1]
-    crease = np.einsum("ij,ij->i", faces[one], faces[other]) < np.cos(np.radians(CREASE_ANGLE))
-    drawn = crease | (seen[one] != seen[other])
-    single = np.ones(len(edges), bool)
-    single[pair] = single[pair + 1] = False
-    chosen = np.concatenate([edges[pair[drawn]], edges[single]])
-    return points[chosen], np.concatenate([(seen[one] | seen[other])[drawn], seen[owner[single]]])
+class Edges:
+    """Edges of a mesh; found once, and then seen from anywhere.
+
+    Args:
+        vertices: (V, 3) [m]; those in one place count as one.
+        triangles: indices, (T, 3).
+    """
+
+    def __init__(self, vertices, triangles):
+        points = np.asarray(vertices, np.float64)
+        triangles = np.asarray(triangles, np.int64)
+        _, first, same = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
+        triangles = first[same.reshape(-1)][triangles]
+        corners = points[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
+        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        owner = np.repeat(np.arange(len(triangles)), 3)
+        order = np.lexsort(edges.T)
+        edges, owner = edges[order], owner[order]
+        pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
+        self._one, self._other = owner[pair], owner[pair + 1]
+        cosine = np.einsum("ij,ij->i", normals[self._one], normals[self._other])
+        self._crease = cosine < np.cos(np.radians(CREASE_ANGLE))
+        self._ends, self._normals, self._corner = points[edges[pair]], normals, corners[:, 0]
+        single = np.ones(len(edges), bool)
+        single[pair] = single[pair + 1] = False
+        self._open_ends, self._open_owner = points[edges[single]], owner[single]
+
+    def seen_from(self, eye):
+        """Ends of creases, silhouettes, open edges (L, 2, 3) [m]; which are on the eye's side."""
+        seen = np.einsum("ij,ij->i", self._normals, eye - self._corner) > 0.0
+        one, other = seen[self._one], seen[self._other]
+        drawn = self._crease | (one != other)
+        ends = np.concatenate([self._ends[drawn], self._open_ends])
+        return ends, np.concatenate([(one | other)[drawn], seen[self._open_owner]])
 
 
 def _lights(frame, surface, lower, upper, scene_size, pixel_angle):

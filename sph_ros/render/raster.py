@@ -8,7 +8,7 @@ rows, so the picture does not depend on the number of threads.
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import bare, device, parallel_kernel
 from sph_ros.render.optics import LAMP, LAMP_LIGHT, SKY_LIGHT, lamp_glint, reflect
 
 #: Bands of rows per picture; more than threads, because the liquid fills only some.
@@ -76,8 +76,8 @@ def _inside(w, ax, ay, bx, by):
     return w > 0.0 or (w == 0.0 and (ax < bx or (ax == bx and ay < by)))
 
 
-@device
-def _barycentric(corners, t, winding, px, py):
+@bare
+def barycentric(corners, t, winding, px, py):
     """Perspective-free weights of the corners at a pixel, and whether it is inside the triangle."""
     ax, ay = corners[t, 0, 0], corners[t, 0, 1]
     bx, by = corners[t, 1, 0], corners[t, 1, 1]
@@ -96,8 +96,8 @@ def _barycentric(corners, t, winding, px, py):
     return hit, u, v, w
 
 
-@device
-def _winding(corners, t):
+@bare
+def winding_of(corners, t):
     """Sign of the area in the image, whose y points down: -1 for a triangle seen from outside."""
     area = (corners[t, 1, 0] - corners[t, 0, 0]) * (corners[t, 2, 1] - corners[t, 0, 1]) - (
         corners[t, 1, 1] - corners[t, 0, 1]
@@ -106,15 +106,16 @@ def _winding(corners, t):
 
 
 @device
-def _span(a, b, c, first, last):
+def span(a, b, c, first, last):
     """Range of pixels that three coordinates span, within first..last - 1."""
     low = min(a, min(b, c))
     high = max(a, max(b, c))
     return int(max(low, float(first))), int(min(high, last - 1.0)) + 1
 
 
-@device
-def _interpolated_normal(normals, t, u, v, w):
+@bare
+def interpolated_normal(normals, t, u, v, w):
+    """Unit normal of triangle t at weights u, v, w of its corners."""
     x = u * normals[t, 0, 0] + v * normals[t, 1, 0] + w * normals[t, 2, 0]
     y = u * normals[t, 0, 1] + v * normals[t, 1, 1] + w * normals[t, 2, 1]
     z = u * normals[t, 0, 2] + v * normals[t, 1, 2] + w * normals[t, 2, 2]
@@ -122,7 +123,7 @@ def _interpolated_normal(normals, t, u, v, w):
     return x * scale, y * scale, z * scale
 
 
-@device
+@bare
 def shade_matt(colour, nx, ny, nz, dx, dy, dz):
     """Linear RGB of a slightly glossy solid: sky from above, lamp, glint (Lambert and Phong)."""
     lamp = max(nx * LAMP[0] + ny * LAMP[1] + nz * LAMP[2], 0.0)
@@ -148,14 +149,14 @@ def draw_solids(corners, normals, colours, view, depth, picture):  # the last tw
     for band in prange(BANDS):
         first, last = band * height // BANDS, (band + 1) * height // BANDS
         for t in range(len(corners)):
-            y0, y1 = _span(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1], first, last)
+            y0, y1 = span(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1], first, last)
             if y0 >= y1:
                 continue
-            x0, x1 = _span(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0], 0, width)
-            winding = _winding(corners, t)
+            x0, x1 = span(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0], 0, width)
+            winding = winding_of(corners, t)
             for y in range(y0, y1):
                 for x in range(x0, x1):
-                    hit, u, v, w = _barycentric(corners, t, winding, x + 0.5, y + 0.5)
+                    hit, u, v, w = barycentric(corners, t, winding, x + 0.5, y + 0.5)
                     if not hit:
                         continue
                     total = u + v + w
@@ -163,7 +164,7 @@ def draw_solids(corners, normals, colours, view, depth, picture):  # the last tw
                     z = total / (u + v + w)
                     if z < depth[y, x]:
                         depth[y, x] = z
-                        nx, ny, nz = _interpolated_normal(normals, t, u, v, w)
+                        nx, ny, nz = interpolated_normal(normals, t, u, v, w)
                         dx, dy, dz = pixel_ray(view, x + 0.5, y + 0.5)
                         s = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
                         if nx * dx + ny * dy + nz * dz > 0.0:
@@ -182,7 +183,7 @@ def view_rays(camera, size) -> np.ndarray:
     return np.stack([camera.eye, corner, right / focal, down / focal])
 
 
-@device
+@bare
 def pixel_ray(view, x, y):
     """World direction through image point (x, y), one metre deep along the view axis."""
     return (
@@ -193,29 +194,30 @@ def pixel_ray(view, x, y):
 
 
 @parallel_kernel
-def draw_liquid(corners, normals, solid_depth, front, back, thickness):  # last three written
+def draw_liquid(corners, normals, solid_depth, bands, front, back, thickness):  # last 3 written
     """Nearest outside, farthest inside and total thickness of a closed mesh.
 
     Args:
         corners: image x, y [pixels] and 1 / depth, (T, 3, 3).
         normals: outward at the corners, world frame, (T, 3, 3).
         solid_depth: depth of what hides the liquid [m], (h, w).
+        bands: of rows, that threads may share; the picture does not depend on it.
         front: depth [m] (infinite where empty) and normal of the nearest front face, (h, w, 4).
         back: the same of the farthest back face before a solid, depth 0 where none, (h, w, 4).
         thickness: of liquid along the view axis before a solid [m], (h, w).
     """
     height, width = thickness.shape
-    for band in prange(BANDS):
-        first, last = band * height // BANDS, (band + 1) * height // BANDS
+    for band in prange(bands):
+        first, last = band * height // bands, (band + 1) * height // bands
         for t in range(len(corners)):
-            y0, y1 = _span(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1], first, last)
+            y0, y1 = span(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1], first, last)
             if y0 >= y1:
                 continue
-            x0, x1 = _span(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0], 0, width)
-            winding = _winding(corners, t)
+            x0, x1 = span(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0], 0, width)
+            winding = winding_of(corners, t)
             for y in range(y0, y1):
                 for x in range(x0, x1):
-                    hit, u, v, w = _barycentric(corners, t, winding, x + 0.5, y + 0.5)
+                    hit, u, v, w = barycentric(corners, t, winding, x + 0.5, y + 0.5)
                     if not hit:
                         continue
                     total = u + v + w
@@ -223,16 +225,19 @@ def draw_liquid(corners, normals, solid_depth, front, back, thickness):  # last 
                     z = total / (u + v + w)
                     thickness[y, x] += winding * min(z, solid_depth[y, x])
                     if winding < 0.0 and z < front[y, x, 0]:
-                        target = front
+                        _put_surface(front, y, x, z, normals, t, u, v, w)
                     elif winding > 0.0 and back[y, x, 0] < z < solid_depth[y, x]:
-                        target = back
-                    else:
-                        continue
-                    nx, ny, nz = _interpolated_normal(normals, t, u, v, w)
-                    target[y, x, 0] = z
-                    target[y, x, 1] = nx
-                    target[y, x, 2] = ny
-                    target[y, x, 3] = nz
+                        _put_surface(back, y, x, z, normals, t, u, v, w)
+
+
+@bare
+def _put_surface(layer, y, x, z, normals, t, u, v, w):
+    """Write depth and normal of triangle t into a layer (h, w, 4)."""
+    nx, ny, nz = interpolated_normal(normals, t, u, v, w)
+    layer[y, x, 0] = z
+    layer[y, x, 1] = nx
+    layer[y, x, 2] = ny
+    layer[y, x, 3] = nz
 
 
 @parallel_kernel
@@ -256,8 +261,8 @@ def draw_spheres(centres, radius, colours, view, focal, depth, picture):  # last
             if cz <= radius + NEAR:
                 continue
             reach = focal * radius / cz
-            y0, y1 = _span(cy - reach, cy, cy + reach, first, last)
-            x0, x1 = _span(cx - reach, cx, cx + reach, 0, width)
+            y0, y1 = span(cy - reach, cy, cy + reach, first, last)
+            x0, x1 = span(cx - reach, cx, cx + reach, 0, width)
             for y in range(y0, y1):
                 for x in range(x0, x1):
                     a, b = (x + 0.5 - cx) / reach, (y + 0.5 - cy) / reach
@@ -277,7 +282,7 @@ def draw_spheres(centres, radius, colours, view, focal, depth, picture):  # last
                         picture[y, x, 2] = b2
 
 
-@device
+@bare
 def _camera_to_world(view, focal, a, b, c):
     """Camera vector in the world frame; view's steps are right and down over focal."""
     fx = view[2, 1] * view[3, 2] - view[2, 2] * view[3, 1]
@@ -306,7 +311,7 @@ def draw_lines(ends, half_width, solid_depth, slack, cover):  # the last is writ
         first, last = band * height // BANDS, (band + 1) * height // BANDS
         for e in range(len(ends)):
             ax, ay, bx, by = ends[e, 0, 0], ends[e, 0, 1], ends[e, 1, 0], ends[e, 1, 1]
-            y0, y1 = _span(min(ay, by) - half_width, max(ay, by) + half_width, ay, first, last)
+            y0, y1 = span(min(ay, by) - half_width, max(ay, by) + half_width, ay, first, last)
             length2 = max((bx - ax) ** 2 + (by - ay) ** 2, 1e-12)
             for y in range(y0, y1):
                 x0, x1 = _row_of_line(ax, ay, bx, by, y, half_width, width)
@@ -320,7 +325,7 @@ def draw_lines(ends, half_width, solid_depth, slack, cover):  # the last is writ
                             cover[y, x] = 1
 
 
-@device
+@bare
 def _row_of_line(ax, ay, bx, by, y, half_width, width):
     """Pixels of row y that a line may touch; `half_width` in pixels to either side."""
     low, high = min(ax, bx), max(ax, bx)

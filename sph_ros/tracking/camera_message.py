@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sensor_msgs/CameraInfo in CDR bytes as a camera model."""
+"""sensor_msgs/CameraInfo in CDR bytes as a camera model, and back."""
 
-from msg_adapters.cdr import CdrReader
-from msg_adapters.header import read_header
+import numpy as np
+
+from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.header import read_header, write_header
 from sph_ros.tracking.camera import camera_from_fields
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -51,3 +53,26 @@ def cdr_to_camera(buffer, rectified=False):
         binning,
         (left, top, roi_width, roi_height),
     )
+
+
+def camera_to_cdr(camera, stamp_ns, frame_id):
+    """A CameraModel as a ready sensor_msgs/CameraInfo of unrectified pictures.
+
+    Args:
+        camera: CameraModel.
+        stamp_ns: time [ns].
+        frame_id: optical frame of the camera.
+    """
+    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+    writer = CdrWriter()
+    write_header(writer, stamp_ns, frame_id)
+    writer.pack("2I", camera.height, camera.width)
+    writer.string("rational_polynomial" if len(distortion) > 5 else "plumb_bob")
+    writer.array(distortion, count=len(distortion))
+    writer.pack("9d", *camera.matrix.ravel())
+    writer.pack("9d", *np.eye(3).ravel())
+    writer.pack("12d", *np.hstack([camera.matrix, np.zeros((3, 1))]).ravel())
+    writer.pack("2I", 0, 0)  # binning
+    writer.pack("4I", 0, 0, 0, 0)  # region of interest: all
+    writer.pack("?", False)
+    return writer.finish()
