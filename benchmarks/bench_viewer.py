@@ -7,6 +7,8 @@ The node runs with `speed` so high that it never waits: whatever anybody takes f
 follow each other again and again, because other programs' load on the machine changes more
 from minute to minute than the viewer costs: only factors of one round are compared. The client is a
 process that reads all that a browser would be sent, and counts. A slow one reads once a second.
+`others` is how many processors were busy with other programs: with more than a few tenths, the
+shares say how the system divides its processors among many rather than what the viewer costs.
 """
 
 import argparse
@@ -16,6 +18,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -65,7 +68,9 @@ def browse(port, pause):
                 data = socket.recv(timeout=0.5)
             except TimeoutError:
                 continue
-            begin = begin or time.monotonic()
+            if begin is None:
+                begin = time.monotonic()
+                print("reading", flush=True)
             length = int.from_bytes(data[8:16], "little")
             window = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + length]))
             for message in window["messages"]:
@@ -153,7 +158,10 @@ def client(port, pause=0.0):
     def end():
         return [float(number) for number in process.communicate("\n")[0].split()]
 
+    end.process = process
+
     try:
+        process.stdout.readline()  # its start takes the processors, too
         yield end
     finally:
         if process.poll() is None:
@@ -168,19 +176,44 @@ def cpu(process):
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(watch, viewer, port, seconds):
-    """One round: load -> (speed, what the client counted, processors the viewer used)."""
-    results = {"nobody looks": (watch.speed(seconds), None, None)}
+def busy():
+    """Processor time that all programs together have used [s]."""
+    with open("/proc/stat") as stat:
+        user, nice, system, _, _, *interrupts = map(int, stat.readline().split()[1:8])
+    return (user + nice + system + sum(interrupts)) / os.sysconf("SC_CLK_TCK")
+
+
+class Load(NamedTuple):
+    """What was measured under one load; processors are mean numbers of busy ones."""
+
+    speed: float
+    fluid: float
+    viewer: float
+    others: float
+    counts: list | None
+
+
+def measure_load(watch, processes, seconds, end=None):
+    """A Load; `end` ends the client and returns what it counted."""
+    ours = (*processes, *([end.process] if end else []))
+    before, all_before, begin = [cpu(p) for p in ours], busy(), time.monotonic()
+    speed = watch.speed(seconds)
+    elapsed = time.monotonic() - begin
+    used = [(cpu(p) - b) / elapsed for p, b in zip(ours, before, strict=True)]
+    others = max(0.0, (busy() - all_before) / elapsed - sum(used))
+    return Load(speed, used[0], used[1], others, end() if end else None)
+
+
+def measure(watch, processes, port, seconds):
+    """One round: name of a load -> Load."""
+    results = {"nobody looks": measure_load(watch, processes, seconds)}
     with watch.listening():
         time.sleep(1.0)
-        results["a subscriber"] = (watch.speed(seconds), None, None)
+        results["a subscriber"] = measure_load(watch, processes, seconds)
     for name, pause in (("a browser", 0.0), ("a slow browser", 1.0)):
         with client(port, pause) as end:
-            time.sleep(2.0)
-            used, begin = cpu(viewer), time.monotonic()
-            speed = watch.speed(seconds)
-            share = (cpu(viewer) - used) / (time.monotonic() - begin)
-            results[name] = (speed, end(), share)
+            time.sleep(1.0)
+            results[name] = measure_load(watch, processes, seconds, end)
         time.sleep(1.0)
     return results
 
@@ -201,7 +234,8 @@ def run(options):
             if fluid.poll() is not None or time.monotonic() > deadline:
                 raise SystemExit("fluid_node did not start")
             time.sleep(0.1)
-        rounds = [measure(watch, viewer, port, options.seconds) for _ in range(options.rounds)]
+        loads = watch, (fluid, viewer), port, options.seconds
+        rounds = [measure(*loads) for _ in range(options.rounds)]
     finally:
         for process in (viewer, fluid):
             process.terminate()
@@ -227,18 +261,20 @@ def main():
         f"{options.scene}: {facts['particles']} particles, {facts['surface_triangles']} triangles, "
         f"{os.cpu_count()} cores, {options.rounds} rounds of {options.seconds:g} s per load"
     )
-    columns = f"{'speed':>7}{'share':>7}{'clouds Hz':>11}{'surfaces Hz':>13}{'MB/s':>7}"
-    print(f"{'':16}{columns}{'viewer cpu':>12}")
-    for load in rounds[0]:
-        rows = [r[load] for r in rounds]
-        share = np.median([r[load][0] / r["nobody looks"][0] for r in rounds])
-        line = f"{load:16}{np.median([row[0] for row in rows]):7.3f}{share:7.2f}"
-        if rows[0][1] is not None:
-            clouds, surfaces, size = np.median([row[1] for row in rows], axis=0)
-            used = np.median([row[2] for row in rows])
-            line += f"{clouds:11.1f}{surfaces:13.1f}{size:7.1f}{used:12.2f}"
-        print(line)
-    each = ", ".join(f"{r['a browser'][0] / r['nobody looks'][0]:.2f}" for r in rounds)
+    print(
+        f"{'':16}{'speed':>7}{'share':>7}{'clouds Hz':>11}{'surfaces Hz':>13}{'MB/s':>7}   "
+        "processors: fluid viewer others"
+    )
+    for name in rounds[0]:
+        loads = [r[name] for r in rounds]
+        speed, fluid, viewer, others = np.median([load[:4] for load in loads], axis=0)
+        share = np.median([r[name].speed / r["nobody looks"].speed for r in rounds])
+        counts = f"{'':31}"
+        if loads[0].counts is not None:
+            clouds, surfaces, size = np.median([load.counts for load in loads], axis=0)
+            counts = f"{clouds:11.1f}{surfaces:13.1f}{size:7.1f}"
+        print(f"{name:16}{speed:7.3f}{share:7.2f}{counts}{fluid:20.2f}{viewer:7.2f}{others:7.2f}")
+    each = ", ".join(f"{r['a browser'].speed / r['nobody looks'].speed:.2f}" for r in rounds)
     print(f"share of the speed alone with a browser, round by round: {each}")
 
 

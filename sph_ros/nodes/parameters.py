@@ -73,7 +73,7 @@ class Settings:
         """Declare what may change while the node runs; defaults from the scene's material."""
         number = self._declare_number
         number("publish_rate", 30.0, 0.1, 1000.0, "publications per second [Hz]; see step_mode")
-        number("surface_rate", 15.0, 0.1, 1000.0, "surfaces per second, at most [Hz]")
+        number("surface_rate", 24.0, 0.1, 1000.0, "surfaces per second, at most [Hz]")
         number("speed", 1.0, 0.01, 100.0, "simulated per real time, in realtime mode [-]")
         number(
             "max_catch_up",

@@ -12,6 +12,10 @@ EDGE_ANGLE = 0.5
 #: Solids less opaque than this [-] are containers: their edges are drawn.
 TRANSPARENT = 0.5
 
+#: A container's faces are drawn larger by this factor: where they coincide with the liquid's they
+#: would hide it in patches.
+CONTAINER_SCALE = 1.02
+
 #: Side of a gizmo over the extent of its solid.
 GIZMO_SCALE = 0.9
 
@@ -107,9 +111,11 @@ class WebSolid:
 
     def _add_mesh(self, mesh, red, green, blue, opacity):
         solid = opacity > TRANSPARENT
+        middle = mesh.bounds.mean(axis=0)
+        faces_at = middle + (1.0 if solid else CONTAINER_SCALE) * (mesh.vertices - middle)
         self._server.scene.add_mesh_simple(
             f"/solids/{self._name}/mesh",
-            mesh.vertices.astype(np.float32),
+            faces_at.astype(np.float32),
             mesh.faces.astype(np.uint32),
             color=as_bytes((red, green, blue)),
             opacity=None if opacity > 0.99 else opacity,

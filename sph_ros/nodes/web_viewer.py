@@ -8,6 +8,7 @@ server and done by the node's timer.
 """
 
 import argparse
+import os
 import sys
 import time
 
@@ -41,6 +42,9 @@ DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 
 #: Pictures per second, at most [Hz].
 DRAW_RATE = 33.0
+
+#: Added to the process's niceness: on a busy machine pictures are left out, not time steps.
+NICENESS = 5
 
 #: So often [Hz] is looked for what people want, and for what else there is to show.
 TURN_RATE = 15.0
@@ -314,6 +318,7 @@ def ros_arguments(argv):
 def main(argv=None):
     """Run the viewer until SIGINT or SIGTERM; returns the exit status."""
     argv = sys.argv[1:] if argv is None else list(argv)
+    os.nice(NICENESS)
     return run_node("web_viewer", WebViewer, ros_arguments(argv), (ViewerError,))
 
 
