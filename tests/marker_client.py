@@ -77,7 +77,7 @@ class TrackerClient:
             self.program = ros.start(NODE, *arguments)
         else:
             self.node = ros.add(MarkerTracker(context=ros.context, cli_args=arguments))
-        self.picture = still_picture()
+        self.picture, self.info = still_picture(), None
         self.stamp_ns = START_NS
 
     def ready(self):
@@ -89,11 +89,18 @@ class TrackerClient:
         """Publish a picture, a thirtieth of a second after the last one; returns its stamp."""
         self.stamp_ns += PERIOD_NS
         picture = self.picture if picture is None else picture
+        if self.info is not None:
+            self.infos.publish(self.info)
         self.images.publish(to_cdr(picture, encoding, self.stamp_ns, "optical"))
         return self.stamp_ns
 
     def calibrate(self, message=None):
-        self.infos.publish(camera_info() if message is None else message)
+        """From now on send a camera_info with each picture, as drivers do.
+
+        One that is sent alone just when two processes find each other may take three seconds.
+        """
+        self.info = camera_info() if message is None else message
+        self.infos.publish(self.info)
 
     def show_until(self, condition, timeout=20.0, **kwargs):
         """Show pictures, 30 a second, until something holds."""

@@ -140,6 +140,7 @@ def test_poses_are_predicted_by_the_age_of_their_pictures():
                 position=np.array([speed * (taken - begin) - 0.15, 0.0, 0.5])
             )
             picture = camera.take([(BALL, place)])
+            client.infos.publish(client.info)
             client.images.publish(
                 image_to_cdr(picture, "mono8", round((taken - latency) * 1e9), "optical")
             )

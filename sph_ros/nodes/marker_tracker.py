@@ -89,6 +89,8 @@ class MarkerTracker(Node):
         )
         if from_topics:
             self._inbox = TopicInput(self, self._input_topics, self._calibration.hear)
+            # Before anything takes long: who sees us hear pictures may send camera_info only once.
+            self._inbox.listen(awake=False)
         else:
             self._inbox = Mailbox()
         self._make_tracker()
