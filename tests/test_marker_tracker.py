@@ -240,6 +240,7 @@ def test_a_marker_wand_stirs_the_liquid(tmp_path, compiled_liquid):
     heard = [cdr_to_pose(data) for data in poses]
     assert len(heard) > 50
     away = [(begin, end + 6) for begin, end in HARD_GAPS]  # and the first pictures after a gap
+    away.append((95, 111))  # turned edge-on: hardly seen, so the filter coasts
     off = []
     for pose in heard:
         frame = round((pose.stamp_ns - START_NS) * 30e-9)
