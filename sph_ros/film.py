@@ -7,10 +7,11 @@ from msg_adapters.bags import open_bag
 from msg_adapters.header import NANOSECONDS
 from msg_adapters.marker import cdr_to_markers
 from msg_adapters.point_cloud import cdr_to_particle_cloud
-from sph_ros.colors import solid_colors
+from sph_ros.colors import liquid_color, solid_colors
 from sph_ros.core.surface import extract_surface
 from sph_ros.render import Camera, Frame, SolidView, render, save_png
 from sph_ros.render.video import VideoWriter
+from sph_ros.sim.liquid import Families
 from sph_ros.sim.shapes import Container, Plane, display_mesh
 
 
@@ -32,6 +33,7 @@ class Film:
         self._scene, self._size = scene, size
         self._video, self._picture_path = VideoWriter(video, size, fps), picture
         self._solids = _Solids(scene)
+        self._families = Families(scene) if len(scene.liquids) > 1 else None
         self._camera = self._picture = None
 
     def __enter__(self):
@@ -43,7 +45,7 @@ class Film:
         if exception[0] is None and self._picture is not None:
             save_png(self._picture_path, self._picture)
 
-    def add(self, positions, velocities, surface, poses):
+    def add(self, positions, velocities, surface, poses, ids=None):
         """Draw a state.
 
         Args:
@@ -51,6 +53,7 @@ class Film:
             velocities: [m/s], (N, 3).
             surface: of the liquid: (vertices, triangles, normals).
             poses: name -> (position, quat_xyzw) of solids; those without one are not drawn.
+            ids: of the particles, (N,), which say what liquid they are of.
         """
         scene = self._scene
         views = self._solids.views(poses)
@@ -61,7 +64,7 @@ class Film:
             views,
             scene.spacing,
             dimension=scene.dimension,
-            colours=self._colours(len(positions)),
+            colours=self._colours(len(positions), ids),
         )
         if self._camera is None:
             bounds = self._solids.bounds(frame, scene.emitters)
@@ -69,8 +72,11 @@ class Film:
         self._picture = render(frame, self._camera, self._size)
         self._video.add(self._picture)
 
-    def _colours(self, count):
+    def _colours(self, count, ids):
         """Red, green, blue of each of `count` particles, None for a clear liquid."""
+        if ids is not None and self._families is not None:
+            table = [liquid_color(material)[:3] for material in self._scene.liquids]
+            return np.array(table)[self._families.of(ids)]
         color = self._scene.material.color
         return None if color is None else np.tile(np.array(color), (count, 1))
 
@@ -138,7 +144,7 @@ def film_of_bag(bag, scene, video, picture, size, fps, progress=lambda done, tot
                 cloud.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
             )
             nearest = int(np.argmin(np.abs(times - stamp_ns)))
-            film.add(cloud.positions, cloud.velocities, surface, poses[nearest][1])
+            film.add(cloud.positions, cloud.velocities, surface, poses[nearest][1], cloud.ids)
             progress(done, len(clouds))
     return len(clouds)
 

@@ -151,7 +151,7 @@ def _record(sim, bag, history, film):
     bag.add(surface)
     history.add(sim)
     if film:
-        film.add(sim.positions, sim.velocities, surface, _poses(sim))
+        film.add(sim.positions, sim.velocities, surface, _poses(sim), sim.ids)
 
 
 _BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated, {elapsed} gone, {remaining} to go"

@@ -9,7 +9,7 @@ import pytest
 
 from sph_ros.cli import main
 from sph_ros.sim.guards import UnstableError
-from sph_ros.sim.scene_types import SOLVERS
+from sph_ros.sim.scene_types import LIQUID_SOLVERS
 from sph_ros.validation import checks, dam_break, floating
 from sph_ros.validation.case import Case, NotAvailableError
 from sph_ros.validation.drops import sphericity
@@ -95,9 +95,9 @@ def test_markdown_has_a_column_for_each_solver_and_failures_in_bold(tmp_path, mo
     fake(monkeypatch, good=0.01, bad=0.2)
     main(["validate", "--markdown", "--out", str(tmp_path)])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
-    assert lines[0].split("|")[4:-1] == [f" `{solver}` " for solver in SOLVERS]
-    assert lines[2] == "| good | 10 m | 5 % |" + " 10.1 (1 %) |" * len(SOLVERS)
-    assert lines[3].count("**12 (20 %)**") == len(SOLVERS)
+    assert lines[0].split("|")[4:-1] == [f" `{solver}` " for solver in LIQUID_SOLVERS]
+    assert lines[2] == "| good | 10 m | 5 % |" + " 10.1 (1 %) |" * len(LIQUID_SOLVERS)
+    assert lines[3].count("**12 (20 %)**") == len(LIQUID_SOLVERS)
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,7 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
         contacts, motion: of this substep.
         rate: share per unit of wall fraction [-], float32.
         drag: share per unit of wall fraction and sliding speed [s/m], float32.
-        scale: particle mass / substep [kg/s].
+        scale: mass of each particle / substep [kg/s], (N,).
         velocities: [m/s], (N, 3); changed.
         reactions: as in `pressure_reactions`; added to.
     """
@@ -235,9 +235,9 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                     positions[i, 0],
                     positions[i, 1],
                     positions[i, 2],
-                    scale * share * sx,
-                    scale * share * sy,
-                    scale * share * sz,
+                    scale[i] * share * sx,
+                    scale[i] * share * sy,
+                    scale[i] * share * sz,
                 )
 
 
@@ -397,7 +397,17 @@ def keep_chunk_outside(
         rounds = 0
         while moved and rounds < 8:
             moved = slide_past_solids(
-                i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
+                i,
+                chunk,
+                starts,
+                ends,
+                shapes,
+                motion,
+                margin,
+                shortest,
+                planar,
+                scale[i],
+                reactions,
             )
             rounds += 1
         clearance[i] = np.float32(0.0)
@@ -447,7 +457,7 @@ def keep_outside(
         margin: distance to keep [m], float32.
         spacing: of the particles [m], float32.
         planar: 2D: positions keep y.
-        scale: particle mass / substep^2 [kg/s^2].
+        scale: mass of each particle / substep^2 [kg/s^2], (N,).
         reactions: as in `pressure_reactions`; added to.
         squeezed: particles per chunk that had no way out but a rescue, (chunks,) int64; added to.
     """

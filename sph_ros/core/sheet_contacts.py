@@ -201,7 +201,8 @@ def stop_chunk_at_sheets(chunk, starts, ends, clearance, sheets, motion, margin,
                 np.float32(cz),
             )
             ends[i, 0], ends[i, 1], ends[i, 2] = wx, wy, wz
-            fx, fy, fz = scale * (x - wx), scale * (y - wy), scale * (z - wz)
+            push = scale[i]
+            fx, fy, fz = push * (x - wx), push * (y - wy), push * (z - wz)
             add_reaction(reactions, chunk, s, motion, x, y, z, fx, fy, fz)
 
 
@@ -216,7 +217,7 @@ def stop_at_sheets(starts, ends, clearance, sheets, motion, margin, scale, react
         clearance: as in `contacts.keep_outside`, which must have been called for these paths.
         sheets, motion: the sheets and the poses of all solids.
         margin: distance to keep [m], float32.
-        scale: particle mass / substep^2 [kg/s^2].
+        scale: mass of each particle / substep^2 [kg/s^2], (N,).
         reactions: as in `contacts.pressure_reactions`; added to.
     """
     for chunk in prange(reactions.shape[0]):
@@ -329,7 +330,7 @@ def bounce_off_sheets(
     sheets,
     motion,
     margin,
-    mass,
+    masses,
     reactions,
 ):
     """Impulses on particles whose path in this substep meets a sheet: restitution and friction.
@@ -343,7 +344,7 @@ def bounce_off_sheets(
         travel: the farthest that a point of any solid moves in it [m], float32.
         sheets, motion: the sheets and the poses of all solids.
         margin: distance that particles keep [m], float32.
-        mass: of a particle [kg].
+        masses: of the particles [kg], (N,).
         reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.
     """
     for chunk in prange(reactions.shape[0]):
@@ -391,7 +392,7 @@ def bounce_off_sheets(
                 velocities[i, 1] += cy
                 velocities[i, 2] += cz
                 vx, vy, vz = vx + cx, vy + cy, vz + cz
-                force = -mass / time_step
+                force = -masses[i] / time_step
                 add_reaction(
                     reactions, chunk, s, motion, x, y, z, force * cx, force * cy, force * cz
                 )

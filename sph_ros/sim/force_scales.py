@@ -38,7 +38,13 @@ from sph_ros.core import mueller_weights as weights
 from sph_ros.core.forces import Factors
 from sph_ros.core.wall_tables import POLY6_AND_SPIKY, flat_wall, flat_wall_laplacian
 from sph_ros.core.weights import NEAR_POWER, POLY6, gradient_sum, lattice_sum
-from sph_ros.sim.scales import LEAST_SPEED, MELTING_TIME, expected_speed, readable_step
+from sph_ros.sim.scales import (
+    LEAST_SPEED,
+    MELTING_TIME,
+    expected_speed,
+    longest_elastic_step,
+    readable_step,
+)
 
 #: Share of the support radius that sound and the fastest expected particle cross in a step.
 COURANT = 0.4
@@ -74,6 +80,7 @@ class ForceScales:
         sound_speed: c [m/s].
         viscosity: dynamic, with what keeps the solver stable [Pa s].
         surface_tension: [N/m].
+        elasticity: shear modulus of springs [Pa].
     """
 
     mass: float
@@ -82,6 +89,7 @@ class ForceScales:
     sound_speed: float
     viscosity: float
     surface_tension: float
+    elasticity: float
 
 
 def force_scales(material, scene, depth):
@@ -98,6 +106,7 @@ def force_scales(material, scene, depth):
         sound_speed=speed,
         viscosity=max(material.viscosity, least * material.density),
         surface_tension=material.surface_tension,
+        elasticity=material.elasticity,
     )
 
 
@@ -187,6 +196,9 @@ def longest_steps(scene, liquids, speed):
     tension = max(liquid.surface_tension / liquid.rest_density for liquid in liquids)
     if tension > 0.0:
         bounds["surface tension"] = 0.5 * math.sqrt(s**3 / (2.0 * math.pi * tension))
+    elastic = max(liquid.elasticity / liquid.rest_density for liquid in liquids)
+    if elastic > 0.0:
+        bounds["elasticity"] = longest_elastic_step(elastic, scene)
     return bounds
 
 

@@ -133,6 +133,7 @@ class IncompressibleSolver(PressureSolver):
         if self._coupling is not None:
             self._coupling.predict()
         self._pull_together(tension, time_step)
+        self._pull_springs(fluid, time_step, time_step**2, work.cohesive)
         self._push_bodies(self._solids.bodies.inertias.centre)
         dt = np.float32(time_step)
         project.push(fluid.velocities, self._gravity, dt, work.cohesive)

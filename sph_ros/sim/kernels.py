@@ -4,10 +4,10 @@
 The process that compiles a kernel runs another machine code of it than processes that load it from
 numba's cache: linked functions are optimised once more for the cache, and sums may then be taken in
 another order. Both are right, but their last bits differ. So no process that simulates compiles:
-the first one has a child do it, and then loads what all later ones load.
+the first one has a child do it, and then loads what all later ones load. Only what a scene needs is
+compiled: the kernels of its solver.
 """
 
-import itertools
 import os
 import subprocess
 import sys
@@ -53,15 +53,25 @@ _SCENE = {
 _SHEET = "v 0 0 0.05\nv 0.1 0 0.05\nv 0 0.1 0.05\nf 1 2 3"
 
 
-def ensure_compiled():
-    """Have all kernels compiled if they are not yet; half a minute then, a moment otherwise.
+def compile_for(scene):
+    """Have the kernels compiled that `scene` needs, if they are not yet."""
+    ensure_compiled(scene.solver, scene.material.elasticity > 0.0)
 
-    Where that fails, say because nothing can be cached, this process compiles for itself.
+
+def ensure_compiled(solver="relaxation", springs=False):
+    """Have the kernels of a solver compiled if they are not yet.
+
+    That takes a minute or two for the first solver, which compiles what all share, some seconds for
+    another one, and a moment later on. Where it fails, say because nothing can be cached, this
+    process compiles for itself.
+
+    Args:
+        solver: its name in scenes.
+        springs: those of elastic materials too.
     """
-    mark = Path(KERNELS) / "complete"
-    if config.DISABLE_JIT or COMPILING in os.environ or mark.exists():
+    if config.DISABLE_JIT or COMPILING in os.environ or _mark(solver, springs).exists():
         return
-    command = [sys.executable, "-m", "sph_ros.sim.kernels"]
+    command = [sys.executable, "-m", "sph_ros.sim.kernels", solver, *(["springs"] * springs)]
     root = str(Path(__file__).parents[2])
     paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, COMPILING: "1", "PYTHONPATH": os.pathsep.join(paths)}
@@ -79,14 +89,21 @@ def ensure_compiled():
         return
 
 
+def _mark(solver, springs):
+    """The file that is there once the kernels are."""
+    return Path(KERNELS) / f"complete_{solver}{'_springs' * springs}"
+
+
 def main():
-    """Take every way through the kernels once, then leave the mark."""
-    from sph_ros.sim.scene_types import SOLVERS
+    """Take every way through the kernels of a solver once, then leave the mark."""
     from sph_ros.sim.simulation import Simulation
 
-    for dimension, solver in itertools.product((3, 2), SOLVERS):
+    solver, springs = sys.argv[1], "springs" in sys.argv[2:]
+    for dimension in (3, 2):
         with tempfile.NamedTemporaryFile("w", suffix=".obj") as mesh:
             scene = {**_SCENE, "dimension": dimension, "solver": solver}
+            if springs:
+                scene["material"] = "cream"
             if dimension == 3:
                 print(_SHEET, file=mesh, flush=True)
                 surface = {"file": mesh.name, "restitution": 0.5}
@@ -98,7 +115,7 @@ def main():
         simulation.advance(0.02)
         simulation.statistics()
         simulation.surface()
-    Path(KERNELS, "complete").touch()
+    _mark(solver, springs).touch()
 
 
 if __name__ == "__main__":

@@ -32,7 +32,13 @@ def fill_liquid(scene):
     Returns:
         (positions, velocities): (N, 3) float32 [m] and [m/s], scene's frame; in 2D y is 0.
     """
-    positions, velocities = np.zeros((0, 3)), np.zeros((0, 3))
+    positions, velocities, _ = fill_blocks(scene)
+    return positions, velocities
+
+
+def fill_blocks(scene):
+    """What `fill_liquid` returns, and of which block each particle is, (N,) int."""
+    positions, velocities, counts = np.zeros((0, 3)), np.zeros((0, 3)), []
     for index, block in enumerate(scene.liquid):
         points = _to_scene(_lattice(block.shape, scene), block.pose)
         if scene.dimension == 2:
@@ -43,7 +49,26 @@ def fill_liquid(scene):
         if scene.dimension == 2:
             velocity[1] = 0.0
         velocities = np.concatenate([velocities, np.broadcast_to(velocity, points.shape)])
-    return np.ascontiguousarray(positions, np.float32), velocities.astype(np.float32)
+        counts.append(len(points))
+    blocks = np.repeat(np.arange(len(counts)), np.array(counts, int))
+    return np.ascontiguousarray(positions, np.float32), velocities.astype(np.float32), blocks
+
+
+def families(scene, blocks):
+    """Index into `scene.liquids` of particles by the block they are of, (N,) uint8."""
+    return np.array(scene.families, np.uint8)[blocks]
+
+
+class Families:
+    """Which of a scene's liquids a particle is of, by its id; for whoever has ids alone."""
+
+    def __init__(self, scene):
+        """Fill the scene's blocks once more; emitted particles are of the first liquid."""
+        self._first = np.append(families(scene, fill_blocks(scene)[2]), np.uint8(0))
+
+    def of(self, ids):
+        """Index into `scene.liquids` of each, (N,) uint8."""
+        return self._first[np.minimum(ids, len(self._first) - 1)]
 
 
 def distances_to(shape, pose, points, scene):

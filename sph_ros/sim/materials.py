@@ -21,6 +21,9 @@ class Material:
         wall_friction: 0 lets the liquid slip along solids, 1 drags it with them [-].
         adhesion: how strongly solids hold the liquid, as a share of its own cohesion [-].
         quadratic_viscosity: Clavet's beta times the spacing: damps pairs that collide fast [-].
+        elasticity: shear modulus of springs between neighbours; 0: a liquid [Pa].
+        yield_strain: relative deformation that springs spring back from [-].
+        plasticity: rate at which they give way beyond that [1/s].
         color: red, green, blue, 0 to 1, of a liquid that is drawn opaque; None: clear as water.
     """
 
@@ -32,6 +35,9 @@ class Material:
     wall_friction: float = quantity("1", 0.1, low=0.0, high=1.0)
     adhesion: float = quantity("1", 0.5, low=0.0, high=1.0)
     quadratic_viscosity: float = quantity("1", 0.3, low=0.0, high=10.0)
+    elasticity: float = quantity("Pa", 0.0, low=0.0, high=1e5)
+    yield_strain: float = quantity("1", 0.1, low=0.0, high=10.0)
+    plasticity: float = quantity("1/s", 0.0, low=0.0, high=1e4)
     color: Vector | None = quantity("1", None, low=0.0, high=1.0)
 
     def __post_init__(self):
@@ -81,6 +87,22 @@ MATERIALS = {
             adhesion=0.8,
             quadratic_viscosity=0.3,
             color=(0.97, 0.94, 0.86),
+            # Whipped: gives way at about 100 Pa.
+            elasticity=1000.0,
+            yield_strain=0.1,
+            plasticity=20.0,
+        ),
+        Material(
+            "jelly",
+            density=1000.0,
+            viscosity=1.0,
+            surface_tension=0.05,
+            compression=0.01,
+            wall_friction=0.5,
+            adhesion=0.5,
+            quadratic_viscosity=0.3,
+            elasticity=2000.0,
+            color=(0.75, 0.12, 0.16),
         ),
         Material(
             "mercury",

@@ -36,7 +36,7 @@ class PressureSolver(Solver):
 
     def set_material(self, material):
         """Use another material from the next substep on."""
-        self._material = material
+        super().set_material(material)
         self.scales = solver_scales(material, self._scene, self._depth)
 
     def stable_time_step(self):

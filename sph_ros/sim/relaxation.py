@@ -122,6 +122,7 @@ class RelaxationSolver(PressureSolver):
         unit = self._pressure_unit(time_step)
         tension = self._tension(unit)
         self._pull_together(tension, time_step)
+        self._pull_springs(fluid, time_step, time_step**2, work.cohesive)
         self._couple(self._solids.bodies.centre, time_step)
         self._push_bodies()
         compliance = np.float32(1.0 / (self.scales.stiffness * unit))

@@ -72,6 +72,7 @@ class Scales:
         neighbors: (1 - r/h) summed over the lattice's neighbours, divided by the dimension [-].
         wall_layers: viscous rate of a wall that holds the liquid, per wall fraction and that of a
             pair [-].
+        elasticity: shear modulus of springs [Pa].
     """
 
     mass: float
@@ -87,6 +88,7 @@ class Scales:
     quadratic: float
     neighbors: float
     wall_layers: float
+    elasticity: float
 
 
 def packing(scene, time):
@@ -134,15 +136,31 @@ def solver_scales(material, scene, depth):
         near_virial_ratio=virial / near_virial,
         viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
-        neighbors=sum(1 - r / h for r, _ in _neighbors(h, s, d) if r > 0.0) / d,
+        neighbors=sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d,
         wall_layers=_wall_layers(h, s, d),
+        elasticity=material.elasticity,
     )
 
 
 def viscous_rate(kinematic, scene):
     """Linear impulse per relative speed and second [1/s] for a kinematic viscosity [m^2/s]."""
     h, s, d = scene.support_radius, scene.spacing, scene.dimension
-    return 2 * d * (d + 2) * kinematic / sum((1 - r / h) * r * r for r, _ in _neighbors(h, s, d))
+    virial = sum((1 - r / h) * r * r for r, _ in lattice_neighbors(h, s, d))
+    return 2 * d * (d + 2) * kinematic / virial
+
+
+def longest_elastic_step(modulus, scene):
+    """Half of the longest stable step with springs [s].
+
+    The stiffest mode moves neighbours against each other: omega^2 = 2 rate sum (1 - r/h) / d.
+
+    Args:
+        modulus: shear modulus over density [m^2/s^2].
+        scene: the scene.
+    """
+    h, s, d = scene.support_radius, scene.spacing, scene.dimension
+    around = sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d
+    return 1.0 / math.sqrt(2.0 * viscous_rate(modulus, scene) * around)
 
 
 def surface_energy(support_radius, spacing, dimension):
@@ -172,7 +190,7 @@ def _wall_layers(support_radius, spacing, dimension):
     return total / _missing(DENSITY_POWER, support_radius, spacing, dimension, 0)
 
 
-def _neighbors(support_radius, spacing, dimension):
+def lattice_neighbors(support_radius, spacing, dimension):
     """(distance [m], height in layers) of the lattice points within the support."""
     reach = math.ceil(support_radius / spacing)
     for offset in itertools.product(range(-reach, reach + 1), repeat=dimension):
@@ -185,7 +203,7 @@ def _missing(power, support_radius, spacing, dimension, layer):
     """Share of the rest density that a particle `layer` layers under a free surface lacks."""
     lacking = math.fsum(
         (1 - r / support_radius) ** power
-        for r, height in _neighbors(support_radius, spacing, dimension)
+        for r, height in lattice_neighbors(support_radius, spacing, dimension)
         if height > layer
     )
     return lacking / lattice_sum(power, support_radius, spacing, dimension)
@@ -226,6 +244,8 @@ def stable_time_step(scene, scales, drop, courant):
     soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)
     if soft > 0:
         bounds["surface tension"] = 0.38 * h / soft
+    if scales.elasticity > 0:
+        bounds["elasticity"] = longest_elastic_step(scales.elasticity / scales.rest_density, scene)
     reason = min(bounds, key=bounds.get)
     step = min(bounds[reason], 0.01)
     return (readable_step(step), reason if step == bounds[reason] else "10 ms at most")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sph_ros.sim.jets import ENDLESS, capacity, make_jet
-from sph_ros.sim.kernels import ensure_compiled
+from sph_ros.sim.kernels import compile_for
 from sph_ros.sim.liquid import (
     BYTES_PER_PARTICLE,
     available_memory,
@@ -213,9 +213,8 @@ def _read_sink(node: Node) -> Sink:
 
 def _read_liquid(node: Node) -> LiquidBlock:
     shape = _read_shape(node, LIQUID_KEYS, None)
-    return build(
-        LiquidBlock, _without(node, LIQUID_KEYS), {"pose": _read_pose}, extra={"shape": shape}
-    )
+    readers = {"pose": _read_pose, "material": _read_material}
+    return build(LiquidBlock, _without(node, LIQUID_KEYS), readers, extra={"shape": shape})
 
 
 def _read_solid(node: Node, folder: Path) -> SolidSpec:
@@ -364,7 +363,7 @@ def _check_openings(scene: Scene, root: Node) -> None:
 
 def _check_solids(scene: Scene, root: Node) -> None:
     """Refuse meshes that cannot be used, and liquid that starts inside a solid."""
-    ensure_compiled()
+    compile_for(scene)
     positions, _ = fill_liquid(scene)
     if scene.liquid and not len(positions):
         raise _item(root, "liquid", 0).error("holds no particle")

@@ -6,7 +6,7 @@ SI units, z up. Every one checks its own values and raises ValueError("field: wh
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sph_ros.sim.materials import Material
 from sph_ros.sim.quantities import (
@@ -30,7 +30,16 @@ from sph_ros.sim.shapes import (
 )
 
 #: Names of the solvers (`sim.solvers` says what they are).
-SOLVERS = ("relaxation", "forces", "incompressible")
+SOLVERS = ("relaxation", "incompressible", "forces", "lennard_jones", "none")
+
+#: Those that know more than one liquid.
+MIXING_SOLVERS = ("forces", "lennard_jones", "none")
+
+#: Those that make particles one liquid, with a density to hold; they know springs, too.
+LIQUID_SOLVERS = ("relaxation", "incompressible", "forces")
+
+#: A particle's liquid is one byte.
+MOST_LIQUIDS = 16
 
 #: Who moves a solid.
 CONTROLS = ("fixed", "topic", "path", "free")
@@ -49,11 +58,15 @@ class LiquidBlock:
         shape: what is filled; its own frame.
         pose: of the shape's frame in the scene's frame.
         velocity: of every particle [m/s], scene's frame.
+        material: of this piece; None: the scene's.
+        color: red, green, blue, 0 to 1; None: the material's.
     """
 
     shape: Shape
     pose: Pose = Pose()
     velocity: Vector = quantity("m/s", (0.0, 0.0, 0.0), low=-100.0, high=100.0)
+    material: Material | None = None
+    color: Vector | None = quantity("1", None, low=0.0, high=1.0)
 
     def __post_init__(self):
         """Refuse shapes that hold no definite amount of liquid."""
@@ -251,7 +264,7 @@ class Scene:
     Attributes:
         name: of the scene.
         spacing: of the particles [m].
-        material: the liquid.
+        material: the liquid, where a piece of it names no other.
         frame: the frame that all positions are in; header.frame_id of the messages.
         dimension: 3, or 2: the liquid lives in the x-z plane.
         support_radius: radius of interaction [m]; None: twice the spacing.
@@ -306,9 +319,34 @@ class Scene:
             )
         self._check_names()
 
+    @property
+    def liquids(self):
+        """Materials of the scene's liquids, one or more, each with its color.
+
+        The first is `material`, and of that are emitted particles. Pieces of the same material and
+        color are one liquid.
+        """
+        found = [self.material]
+        for block in self.liquid:
+            material = self._material_of(block)
+            if material not in found:
+                found.append(material)
+        return tuple(found)
+
+    @property
+    def families(self):
+        """Index into `liquids` of each piece in `liquid`."""
+        liquids = self.liquids
+        return tuple(liquids.index(self._material_of(block)) for block in self.liquid)
+
+    def _material_of(self, block):
+        material = block.material or self.material
+        return material if block.color is None else replace(material, color=block.color)
+
     def _check_words(self):
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: expected one of {SOLVERS}, got {self.solver!r}")
+        self._check_liquids()
         if type(self.dimension) is not int or self.dimension not in (2, 3):
             raise ValueError(f"dimension: expected 2 or 3, got {self.dimension!r}")
         for key in ("name", "frame", "description"):
@@ -317,9 +355,46 @@ class Scene:
         if not self.frame or self.frame.startswith("/") or " " in self.frame:
             raise ValueError(f"frame: expected a frame id without / in front, got {self.frame!r}")
 
+    def _check_liquids(self):
+        for index, block in enumerate(self.liquid):
+            other = block.material or self.material
+            if not alike(other, self.material) and self.solver not in MIXING_SOLVERS:
+                raise ValueError(
+                    f"liquid[{index}].material: {other.name!r} beside {self.material.name!r}, and "
+                    f"solver {self.solver!r} knows one material; {MIXING_SOLVERS} know several"
+                )
+        fault = spring_fault(self, self.liquids)
+        if fault:
+            raise ValueError(f"material.elasticity: {fault}")
+        if len(self.liquids) > MOST_LIQUIDS:
+            raise ValueError(f"liquid: expected at most {MOST_LIQUIDS} liquids of different looks")
+
     def _check_names(self):
         seen = set()
         for index, solid in enumerate(self.solids):
             if solid.name in seen:
                 raise ValueError(f"solids[{index}].name: {solid.name!r} is the name of two solids")
             seen.add(solid.name)
+
+
+def alike(one, other):
+    """Whether two materials differ in name and color at most."""
+    return replace(one, name=other.name, color=other.color) == other
+
+
+def spring_fault(scene, materials):
+    """Why springs cannot be, in words; None where they can, or are not asked for.
+
+    Args:
+        scene: for its solver.
+        materials: of all its liquids.
+    """
+    elastic = next((material for material in materials if material.elasticity > 0.0), None)
+    if elastic is None:
+        return None
+    given = f"got {elastic.elasticity:g} Pa of {elastic.name!r}"
+    if scene.solver not in LIQUID_SOLVERS:
+        return f"expected 0, because solver {scene.solver!r} knows no springs; {given}"
+    if not all(alike(material, elastic) for material in materials):
+        return f"expected 0 where several liquids meet, {given}"
+    return None

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene that runs: particles and solids through time."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,18 +10,18 @@ from sph_ros.core.surface import extract_surface
 from sph_ros.sim.emitters import Emitters
 from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
 from sph_ros.sim.jets import capacity
-from sph_ros.sim.kernels import ensure_compiled
-from sph_ros.sim.liquid import fill_liquid
+from sph_ros.sim.kernels import compile_for, ensure_compiled
+from sph_ros.sim.liquid import families, fill_blocks
 from sph_ros.sim.materials import changed
 from sph_ros.sim.scales import scene_depth
 from sph_ros.sim.scene import load_scene
-from sph_ros.sim.scene_types import Scene
+from sph_ros.sim.scene_types import Scene, alike, spring_fault
 from sph_ros.sim.shapes import Container
 from sph_ros.sim.sinks import Sinks
 from sph_ros.sim.snapshots import read_snapshot, write_snapshot
 from sph_ros.sim.solids import Solids
 from sph_ros.sim.solvers import SOLVER_CLASSES
-from sph_ros.sim.state import Fluid
+from sph_ros.sim.state import FAMILY, Fluid, family_of
 
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
 SOLID_REACH, PARTICLE_REACH = 0.75, 0.8
@@ -53,18 +54,20 @@ class Simulation:
         Raises:
             SceneError: something in the scene is wrong.
         """
-        ensure_compiled()
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        compile_for(self.scene)
         self.material = self.scene.material
         self._solids = Solids(self.scene, SOLVER_CLASSES[self.scene.solver].WEIGHTS)
         self._start()
 
     def _start(self):
         """First state: the liquid of the scene, solids at their first poses."""
-        positions, velocities = fill_liquid(self.scene)
+        positions, velocities, blocks = fill_blocks(self.scene)
         depth = scene_depth(self.scene, positions)
         self.capacity = capacity(self.scene, len(positions))
         self._fluid = Fluid(positions, velocities, capacity=self.capacity)
+        if len(self.scene.liquids) > 1:
+            self._fluid.extras[FAMILY] = families(self.scene, blocks)
         self._next_id = len(positions)
         self._emitters = Emitters(self.scene)
         self._sinks = Sinks(self.scene, self._solids, positions)
@@ -89,6 +92,13 @@ class Simulation:
         """Hand a material to the solver; the longest stable substep goes with it."""
         self.material = material
         used, self.notes = tamed(material, self.scene, self._stable_step_of)
+        others = [other for other in self.scene.liquids if not alike(other, self.scene.material)]
+        fault = spring_fault(self.scene, [material, *others])
+        if fault:
+            used = dataclasses.replace(used, elasticity=0.0)
+            self.notes.append(f"elasticity: {fault}; there are no springs")
+        elif material.elasticity > 0.0:
+            ensure_compiled(self.scene.solver, springs=True)
         self._stable_step, _ = self._stable_step_of(used)
 
     def _stable_step_of(self, material):
@@ -229,7 +239,7 @@ class Simulation:
         simulation._steps = numbers["steps"]
         simulation.time_step, simulation.time_step_reason = numbers["time_step"]
         simulation._substeps = numbers["substeps"]
-        simulation._reactions[:] = numbers["reactions"]
+        simulation._reactions[:] = np.reshape(numbers["reactions"], (-1, 6))
         simulation._solids.set_state(numbers)
         return simulation
 
@@ -253,8 +263,13 @@ class Simulation:
     @property
     def densities(self):
         """Densities at the present positions [kg/m^3], (N,) float32; a copy."""
-        relative = self._relative_densities()
-        return self._fluid.public(relative * np.float32(self.material.density))
+        rest = self._solver.rest_densities(self._fluid)
+        return self._fluid.public(self._relative_densities() * rest)
+
+    @property
+    def families(self):
+        """Index into `scene.liquids` of each particle's liquid, (N,) uint8; a copy."""
+        return self._fluid.public(family_of(self._fluid))
 
     @property
     def pressures(self):
@@ -377,7 +392,7 @@ class Simulation:
             of depth.
         """
         velocities = self._fluid.velocities.astype(np.float64)
-        mass = self._solver.scales.mass
+        mass = self._solver.masses(self._fluid).astype(np.float64)
         excess = np.maximum(self._relative_densities() - 1.0, 0.0)
         square = np.einsum("ij,ij->i", velocities, velocities)
         solid_momentum, solid_energy = self._solids.bodies.facts()
@@ -386,8 +401,8 @@ class Simulation:
             "particle_count": len(self._fluid),
             "mean_compression": float(excess.mean()) if len(excess) else 0.0,
             "max_compression": float(excess.max(initial=0.0)),
-            "kinetic_energy": 0.5 * mass * float(square.sum()),
-            "momentum": mass * velocities.sum(axis=0),
+            "kinetic_energy": 0.5 * float(mass @ square),
+            "momentum": mass @ velocities,
             "mean_speed": float(np.sqrt(square).mean()) if len(square) else 0.0,
             "max_speed": math.sqrt(float(square.max(initial=0.0))),
             "emitted_particles": self._emitters.emitted,

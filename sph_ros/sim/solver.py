@@ -11,7 +11,10 @@ from sph_ros.core import neighbors as search
 from sph_ros.core import sheet_contacts as sheets
 from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim.guards import UnstableError
-from sph_ros.sim.state import Workspace, make_grid
+from sph_ros.sim.scales import viscous_rate
+from sph_ros.sim.scene_types import alike
+from sph_ros.sim.springs import Springs
+from sph_ros.sim.state import Workspace, family_of, make_grid
 
 #: Distance that particles keep from solids, as a share of the spacing.
 MARGIN = 0.05
@@ -37,6 +40,9 @@ class Solver:
         self._scene = scene
         self._solids = solids
         self._depth = depth
+        # Pieces that differ in color alone are of the same liquid to a solver.
+        self._unlike = [not alike(material, scene.material) for material in scene.liquids]
+        self._mixed = any(self._unlike)
         self._gravity = np.array(scene.gravity, np.float32)
         if scene.dimension == 2:
             self._gravity[1] = 0.0
@@ -44,12 +50,61 @@ class Solver:
         self._work = Workspace(0, len(solids), solids.slots)
         self._packing = 1.0
         self._listed = None
+        self._springs = Springs(scene)
         self.iterations = 0
         self.density_error = 0.0
         self.fastest = 0.0
         self.squeezed = 0
         self.timings = {}
         self.set_material(scene.material)
+
+    def set_material(self, material):
+        """Use another material from the next substep on; the scene's other liquids keep theirs."""
+        self._material = material
+
+    def _pull_springs(self, fluid, time_step, per_pull, pulls):
+        """Add what the springs of the liquid pull, if it has any.
+
+        Args:
+            fluid: its springs yield, break and form.
+            time_step: [s].
+            per_pull: 1 for accelerations, time_step^2 for displacements.
+            pulls: [m/s^2] or [m], (N, 3); added to.
+        """
+        material = self._material
+        if material.elasticity == 0.0:
+            self._springs.forget(fluid)
+            return
+        rate = viscous_rate(material.elasticity / material.density, self._scene)
+        self._springs.pull(fluid, self._work, material, per_pull * rate, time_step, pulls)
+
+    @property
+    def materials(self):
+        """Of all liquids; the index is the family of their particles."""
+        pairs = zip(self._unlike, self._scene.liquids, strict=True)
+        return [liquid if unlike else self._material for unlike, liquid in pairs]
+
+    def rest_densities(self, fluid):
+        """Rest density of each particle [kg/m^3], (N,) float32, rows as in `fluid`."""
+        table = np.array([material.density for material in self.materials], np.float32)
+        return table[family_of(fluid)]
+
+    def masses(self, fluid):
+        """Mass of each particle [kg] (2D: per metre of depth), (N,) float32, rows as in `fluid`."""
+        return self.rest_densities(fluid) * np.float32(self._scene.spacing**self._scene.dimension)
+
+    def _weigh(self, fluid):
+        """Keep the masses of the rows as they are now, where they differ."""
+        if self._mixed:
+            self._work.masses[:] = self.masses(fluid)
+
+    def _scaled_masses(self, factor):
+        """Masses of the rows times a factor, (N,) float32, for kernels."""
+        work, scene = self._work, self._scene
+        if self._mixed:
+            return np.multiply(work.masses, np.float32(factor), out=work.scales)
+        work.scales[:] = self._material.density * scene.spacing**scene.dimension * factor
+        return work.scales
 
     def longest_step(self):
         """The longest substep [s] that the present accelerations allow."""
@@ -95,6 +150,7 @@ class Solver:
             self._work = Workspace(fluid.capacity, len(self._solids), self._solids.slots)
         if self._work.count != len(fluid):
             self._work.fit(len(fluid))
+        self._weigh(fluid)
 
     def _clock(self, part):
         now = time.perf_counter()
@@ -127,7 +183,7 @@ class Solver:
                 solids.sheets,
                 solids.motion,
                 np.float32(MARGIN * self._scene.spacing),
-                np.float32(self.scales.mass),
+                self.masses(fluid),
                 reactions,
             )
         return reactions.sum(axis=0)
@@ -155,7 +211,7 @@ class Solver:
             self._solids.sheets,
             motion,
             np.float32(MARGIN * self._scene.spacing),
-            np.float32(self.scales.mass / time_step**2),
+            self._scaled_masses(1.0 / time_step**2),
             self._work.reactions,
         )
 
@@ -173,7 +229,7 @@ class Solver:
             np.float32(MARGIN * scene.spacing),
             np.float32(scene.spacing),
             scene.dimension == 2,
-            np.float32(self.scales.mass / time_step**2),
+            self._scaled_masses(1.0 / time_step**2),
             work.reactions,
             work.squeezed,
         )
@@ -198,6 +254,7 @@ class Solver:
         search.gather_rows(work.order, work.predicted, work.scratch)
         work.predicted, work.scratch = work.scratch, work.predicted
         fluid.reorder(work.order)
+        self._weigh(fluid)
 
     def _find_contacts(self, time_step, clearance, motion=None):
         """Contacts with the solids at the end of `motion`, the present one unless given."""

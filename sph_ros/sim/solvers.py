@@ -3,10 +3,14 @@
 
 from sph_ros.sim.forces import ForcesSolver
 from sph_ros.sim.incompressible import IncompressibleSolver
+from sph_ros.sim.lennard_jones import LennardJonesSolver
 from sph_ros.sim.relaxation import RelaxationSolver
+from sph_ros.sim.uncoupled import UncoupledSolver
 
 SOLVER_CLASSES = {
-    "forces": ForcesSolver,
     "relaxation": RelaxationSolver,
     "incompressible": IncompressibleSolver,
+    "forces": ForcesSolver,
+    "lennard_jones": LennardJonesSolver,
+    "none": UncoupledSolver,
 }

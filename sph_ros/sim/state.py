@@ -14,6 +14,9 @@ MOST_CELLS_AT_LEAST = 1 << 16
 #: What the names of a fluid's extras begin with in a snapshot.
 EXTRA = "extra_"
 
+#: The extra that says which of several liquids a particle is of; missing where there is one.
+FAMILY = "family"
+
 
 class Fluid:
     """The liquid: one row per particle, sorted by cell.
@@ -130,6 +133,12 @@ class Fluid:
         self._resize(count)
 
 
+def family_of(fluid):
+    """Which of the scene's liquids each particle is of, (N,) uint8, rows as in `fluid`."""
+    family = fluid.extras.get(FAMILY)
+    return np.zeros(len(fluid), np.uint8) if family is None else family
+
+
 class Workspace:
     """Scratch memory for one step of N particles among S solids. Holds no result.
 
@@ -144,6 +153,7 @@ class Workspace:
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses, targets, yielded: of the pressure iterations, (N,) float32.
+        masses: of the particles where they differ [kg]; scales: times a factor, (N,) float32.
         errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
         totals: (chunks, 3) float64.
         reactions: wrench per chunk and solid, (chunks, S, 6) float64.
@@ -164,6 +174,8 @@ class Workspace:
         "guesses": (0, np.float32),
         "targets": (0, np.float32),
         "yielded": (0, np.float32),
+        "masses": (0, np.float32),
+        "scales": (0, np.float32),
     }
 
     def __init__(self, capacity, solids, slots=None, pairs_per_particle=44):

@@ -76,13 +76,14 @@ def apply_viscosity(work, velocities, rates, motion):
                 work.reactions,
             )
     if touching:
+        work.scales[:] = rates.inertia
         touch.rub_on_solids(
             work.predicted,
             work.contacts,
             motion,
             np.float32(0.0 if implicit else rates.wall),
             np.float32(rates.wall_quadratic),
-            np.float32(rates.inertia),
+            work.scales,
             velocities,
             work.reactions,
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sph_ros.sim.scene_types import SOLVERS
+from sph_ros.sim.scene_types import LIQUID_SOLVERS
 from sph_ros.validation.checks import (
     CHECKS,
     chosen,
@@ -32,9 +32,9 @@ def validate(options):
             print(f"{name:14} {words}")
         return 0
     names = chosen(options.names)
-    solvers = list(SOLVERS) if options.solver == "all" else [options.solver]
-    if solvers[0] not in SOLVERS:
-        known = ", ".join(SOLVERS)
+    solvers = list(LIQUID_SOLVERS) if options.solver == "all" else [options.solver]
+    if solvers[0] not in LIQUID_SOLVERS:
+        known = ", ".join(LIQUID_SOLVERS)
         raise ValidateError(f"--solver: expected all or one of {known}; got {options.solver!r}")
     data = None if options.data is None else _readable(options.data)
     folder = _writable(options.out)
@@ -61,7 +61,8 @@ def _run(names, solvers, quick, data):
     from sph_ros.sim.kernels import ensure_compiled
 
     with preparing():
-        ensure_compiled()
+        for solver in solvers:
+            ensure_compiled(solver)
     outcomes = []
     bar = tqdm(total=len(names) * len(solvers), disable=None, leave=False, bar_format=_BAR)
 
