@@ -9,7 +9,7 @@ import pytest
 import sph_ros
 from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.materials import MATERIALS, RANGES
-from sph_ros.sim.scene_types import SOLVERS
+from sph_ros.sim.scene_types import LIQUID_SOLVERS, SOLVERS
 
 TANK = {
     "spacing": 0.02,
@@ -26,12 +26,12 @@ TANK = {
 }
 
 
-#: Arrays that the next step depends on; `forces` reckons its pressures anew.
+#: Arrays that the next step depends on; only solvers that iterate start from the last pressures.
 STATE = [
     (name, solver)
     for name in ("velocities", "positions", "pressures")
     for solver in SOLVERS
-    if (name, solver) != ("pressures", "forces")
+    if name != "pressures" or solver in ("relaxation", "incompressible")
 ]
 
 
@@ -98,7 +98,7 @@ def test_a_tension_that_no_step_can_bear_is_lowered_and_said():
 CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", LIQUID_SOLVERS)
 @pytest.mark.parametrize("corner", CORNERS)
 def test_no_corner_of_the_materials_ranges_explodes(corner, solver):
     """A ball that jumps through liquids with extreme numbers, near and far neighbours."""
@@ -109,7 +109,9 @@ def test_no_corner_of_the_materials_ranges_explodes(corner, solver):
     material["compression"] = RANGES["compression"][1 - heavy]
     scene = {**TANK, "material": material, "solver": solver}
     scene["support_radius"] = 0.06 if wide else 0.032
-    sim = sph_ros.Simulation({**scene, "time_step": 0.002})
+    # Explicit viscosity would cut a step of 2 ms into 50,000.
+    step = min(0.002, sph_ros.Simulation(scene).time_step) if solver == "forces" else 0.002
+    sim = sph_ros.Simulation({**scene, "time_step": step})
     # Twice what the ball's 3 m/s and the tension of a drop of one particle can bring about.
     speed = 6.0 + 2.0 * np.sqrt(material["surface_tension"] / (material["density"] * 0.02))
     step = substeps = 0
