@@ -68,6 +68,7 @@ PICTURES = [
     ("opencv_doc/singlemarkersoriginal.jpg", "DICT_6X6_250", [23, 40, 62, 98, 124, 203]),
     ("opencv_doc/choriginal.jpg", "DICT_6X6_250", None),
     ("opencv_doc/chocclusion.jpg", "DICT_6X6_250", None),
+    ("clover/map.png", "DICT_4X4_250", [2, 3]),
     ("bipedal/aruco-sample.png", "DICT_4X4_50", [2, 6, 8]),
     ("sksurgery/output.avi", "DICT_4X4_50", None),
     ("sksurgery/12markers.avi", "DICT_6X6_250", list(range(1, 13))),
@@ -212,6 +213,24 @@ def test_a_marker_seen_edge_on_comes_back():
     assert 15 <= seen <= 55
     assert np.linalg.norm(places, axis=1).max() < 0.02
     assert np.linalg.norm(off[:3]) < 0.003 and np.degrees(np.linalg.norm(off[3:])) < 4.0
+
+
+def test_a_lost_marker_is_followed_from_the_picture_after_the_one_that_shows_it():
+    """It came back elsewhere: one picture to find it, the next to believe it."""
+    camera = SyntheticCamera(CAMERA)
+    tracker = Tracker(TrackerSettings(solids=(BALL,), world=WORLD))
+    moved = Pose(CENTRE.rotation, CENTRE.position + (0.05, 0.08, 0.0))
+    statuses, found = [], []
+    for k in range(50):
+        placed = [(WORLD, CAMERA_FROM_WORLD)]
+        if k < 10 or k >= 35:
+            placed.append((BALL, CAMERA_FROM_WORLD @ (CENTRE if k < 10 else moved)))
+        result = tracker.process(camera.take(placed), round((k / FPS + 1) * 1e9), CAMERA)
+        found.append(any(detection.id == 1 for detection in result.detections))
+        statuses.append(result.solids["ball"].status)
+    first = found.index(True, 35)
+    assert statuses[34] == "lost" and first <= 38
+    assert statuses[first : first + 3] == ["lost", "tracking", "tracking"]
 
 
 def test_pictures_of_another_size_and_stragglers():

@@ -35,6 +35,9 @@ def truth_of_hand(seconds, seed=1, **motion):
 #: Pictures of `hard_hand` in which the hand's marker is out of sight.
 HARD_GAPS = ((20, 21), (30, 33), (45, 75))
 
+#: Pictures in which it is edge-on or shows its back.
+HARD_TURN = (90, 105)
+
 _HARD = Flaws(
     noise=6,
     defocus=0.9,

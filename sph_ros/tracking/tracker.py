@@ -204,10 +204,9 @@ class Tracker:
         expected = []
         for followed in self._followed.values():
             target, pixels = followed.target, None
-            age = followed.track.age(self._time)
-            prediction = followed.prediction(base, self._time) if age < RECENTLY else None
-            if prediction is not None:
-                points = prediction.pose.apply(target.points(target.ids))
+            pose, age = followed.expected(base, self._time)
+            if pose is not None:
+                points = pose.apply(target.points(target.ids))
                 pixels = camera.project(points) if points[:, 2].min() > NEAR else None
             expected.append(Expected(target.ids, pixels, age))
         return expected
@@ -291,6 +290,23 @@ class _Followed:
             return Prediction(estimate.pose, estimate.covariance[:6, :6])
         covariance = composed_covariance(*base, estimate.pose, estimate.covariance[:6, :6])
         return Prediction(base[0] @ estimate.pose, covariance)
+
+    def expected(self, base, time):
+        """(pose, age): where to look for it in the camera's frame, and since when it is known [s].
+
+        What was just found again counts as well before it is believed: else a target that was lost
+        would be looked for everywhere once more. The pose is None when nothing new is known.
+        """
+        age = self.track.age(time)
+        if age < RECENTLY:
+            prediction = self.prediction(base, time)
+            return prediction and prediction.pose, age
+        if self.target is self._settings.world:
+            base = IDENTITY, None
+        found = self.track.candidate
+        if base is None or found is None or time - found[0] >= RECENTLY:
+            return None, age
+        return base[0] @ found[1], time - found[0]
 
     def observe_in(self, base, by_id, camera, time):
         """Measure in the camera's frame, filter in the reference frame."""

@@ -85,6 +85,11 @@ class Track:
         """Time since the target was seen [s]; infinite before."""
         return math.inf if self.seen is None else time - self.seen
 
+    @property
+    def candidate(self):
+        """(time, pose) of the last refused measurement, which may be a new start; else None."""
+        return None
+
     def status(self, time):
         """One of never seen, tracking, coasting, lost."""
         if self.seen is None:
@@ -165,6 +170,14 @@ class KalmanTrack(Track):
         self._before = None  # (state, time) without the last measurement, its surprise
         self._candidates = []
         self._forget()
+
+    @property
+    def candidate(self):
+        """(time, pose) of the last refused measurement, which may be a new start; else None."""
+        if not self._candidates:
+            return None
+        time, measurement = self._candidates[-1]
+        return time, measurement.pose
 
     def observe(self, time, measurement):
         """Use a measurement, or refuse it as an outlier; returns whether it was used."""
