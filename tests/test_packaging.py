@@ -114,6 +114,21 @@ def test_the_readme_names_every_program_scene_and_parameter():
         assert 10_000 < (ROOT / picture).stat().st_size < 400_000
 
 
+@pytest.mark.parametrize("program", ["fluid_node", "marker_tracker", "ar_overlay"])
+def test_help_names_every_parameter_and_wrong_arguments_are_refused(program, capsys):
+    """Of programs whose options are ROS parameters; without starting a node."""
+    pytest.importorskip("rclpy", reason="ROS is not installed: rclpy cannot be imported")
+    main = importlib.import_module(PROGRAMS[program]).main
+    assert main(["--help"]) == 0
+    listed = re.findall(r"^  ([\w.]+)$", capsys.readouterr().out, re.MULTILINE)
+    name = {"fluid_node": "", "marker_tracker": "marker_", "ar_overlay": "overlay_"}[program]
+    source = (ROOT / f"sph_ros/nodes/{name}parameters.py").read_text(encoding="utf-8")
+    declared = set(re.findall(r'(?:_declare|number|fixed)\(\s*"(\w+)"', source))
+    assert len(declared) >= 6 and declared <= set(listed)
+    assert main(["ball_tank"]) == 2
+    assert "'ball_tank'" in capsys.readouterr().err
+
+
 def test_the_table_of_materials_says_what_the_code_says():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     section = readme.partition("## Materials")[2].partition("\n## ")[0]

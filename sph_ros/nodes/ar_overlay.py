@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numba
@@ -26,6 +27,7 @@ from msg_adapters.header import NANOSECONDS
 from msg_adapters.image import compressed_image_to_cdr, image_to_cdr
 from msg_adapters.pose import cdr_to_pose
 from sph_ros.nodes.frames import make_transform
+from sph_ros.nodes.help_texts import help_text
 from sph_ros.nodes.image_source import decoded
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status
@@ -338,7 +340,13 @@ def _wrapped(text, length=88):
 
 def main(argv=None):
     """Run the node until SIGINT or SIGTERM; returns the exit status."""
-    return run_node("ar_overlay", ArOverlay, argv, (OverlayParameterError,))
+    explain = partial(
+        help_text,
+        "ar_overlay",
+        "Draws the liquid of a fluid_node into a camera's pictures.",
+        OverlayParameters,
+    )
+    return run_node("ar_overlay", ArOverlay, argv, (OverlayParameterError,), explain)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ whatever comes then (a bag that loops, a simulator that was reset) is another ru
 """
 
 import sys
+from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
@@ -31,7 +32,8 @@ from sph_ros.nodes.diagnostics import (
 )
 from sph_ros.nodes.drivers import LockstepDriver, ThreadDriver
 from sph_ros.nodes.frames import make_transform
-from sph_ros.nodes.parameters import MATERIAL_PREFIX, ParameterError, Settings
+from sph_ros.nodes.help_texts import help_text
+from sph_ros.nodes.parameters import MATERIAL_PREFIX, ParameterError, Settings, declare_all
 from sph_ros.nodes.poses import PoseGate, PoseRefusedError
 from sph_ros.nodes.publications import Publications
 from sph_ros.nodes.runner import Runner
@@ -395,7 +397,8 @@ class FluidNode(Node):
 
 def main(argv=None):
     """Run the node until SIGINT or SIGTERM; returns the exit status."""
-    return run_node("fluid_node", FluidNode, argv, (SceneError, ParameterError))
+    explain = partial(help_text, "fluid_node", "Simulates the liquid of a scene.", declare_all)
+    return run_node("fluid_node", FluidNode, argv, (SceneError, ParameterError), explain)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import traceback
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from msg_adapters.image import COMPRESSED_IMAGE
+from sph_ros.nodes.help_texts import help_text
 from sph_ros.nodes.image_source import Encoded, Picture, SourceError, decoded, make_source
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status, target_status
@@ -348,8 +350,14 @@ def _kind(error):
 
 def main(argv=None):
     """Run the node until SIGINT or SIGTERM; returns the exit status."""
+    explain = partial(
+        help_text,
+        "marker_tracker",
+        "Finds printed ArUco markers in pictures; publishes where camera and solids are.",
+        MarkerParameters,
+    )
     errors = (TrackerParameterError, TargetError, DictionaryError, SourceError)
-    return run_node("marker_tracker", MarkerTracker, argv, errors)
+    return run_node("marker_tracker", MarkerTracker, argv, errors, explain)
 
 
 if __name__ == "__main__":

@@ -168,6 +168,13 @@ class Settings:
         self._apply([parameter.name for parameter in parameters])
 
 
+def declare_all(node):
+    """Declare every parameter, with the defaults of water: for those who want to know of them."""
+    settings = Settings(node)
+    _, step_mode = settings.declare_first()
+    settings.declare_live(Material(), step_mode)
+
+
 def within_range(field, value):
     """The value; at a bound where rclpy's tolerance let it slip over by a rounding error."""
     low, high = RANGES[field]

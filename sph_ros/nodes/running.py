@@ -28,7 +28,7 @@ class _ArgumentError(ValueError):
     """The ROS arguments cannot be understood."""
 
 
-def run_node(program, make_node, argv=None, errors=()):
+def run_node(program, make_node, argv=None, errors=(), explain=None):
     """Make a node, spin it until SIGINT or SIGTERM, and leave nothing behind.
 
     Args:
@@ -36,10 +36,15 @@ def run_node(program, make_node, argv=None, errors=()):
         make_node: called without arguments after `rclpy.init`.
         argv: arguments after the program's name; None for those of the process.
         errors: exception types that are the user's mistakes: one line instead of a traceback.
+        explain: makes the text of ``--help``; with it all other arguments must be ROS's.
 
     Returns:
-        The exit status: 0 after a signal, 1 after an error.
+        The exit status: 0 after a signal or ``--help``, 1 after an error, 2 for wrong arguments.
     """
+    argv = sys.argv[1:] if argv is None else list(argv)
+    own = argv[: argv.index("--ros-args")] if "--ros-args" in argv else argv
+    if own and explain is not None:
+        return _answer(program, own, explain)
     # Python's own handlers end a long start (compiling) at once; rclpy's would wait for spin.
     signal.signal(signal.SIGINT, _terminate)
     signal.signal(signal.SIGTERM, _terminate)
@@ -56,12 +61,22 @@ def run_node(program, make_node, argv=None, errors=()):
     return _spin(node)
 
 
+def _answer(program, own, explain):
+    """Explain the program, or say what is wrong with its own arguments; returns the exit status."""
+    if {"-h", "--help"} & set(own):
+        print(explain())
+        return 0
+    print(
+        f"{program}: error: unknown argument {own[0]!r}; parameters are set with --ros-args -p "
+        "NAME:=VALUE, and --help lists them",
+        file=sys.stderr,
+    )
+    return 2
+
+
 def _init(argv):
     try:
-        rclpy.init(
-            args=None if argv is None else ["node", *argv],
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        rclpy.init(args=["node", *argv], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # what stands after --ros-args
         raise _ArgumentError(error) from error
 

@@ -21,7 +21,7 @@ def add_markers(commands):
         "markers",
         help="a PDF of the printed markers at true size",
         description="Three pages: the two default markers with a ruler, the net of a cube wand, "
-        "and a board for `sph_ros calibrate`. Print at 100 %%.",
+        "and a board for `sph_ros calibrate`. Print at 100 %.",
     )
     parser.add_argument("--out", metavar="FILE", default="markers.pdf", help="default: markers.pdf")
     parser.add_argument("--paper", choices=("a4", "letter"), default="a4", help="default: a4")
