@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A running simulation, or the recorded bag of one, as a video and its last picture."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from msg_adapters.bags import open_bag
@@ -34,7 +36,7 @@ class Film:
         self._video, self._picture_path = VideoWriter(video, size, fps), picture
         self._solids = _Solids(scene)
         self._families = Families(scene) if len(scene.liquids) > 1 else None
-        self._camera = self._picture = None
+        self._camera = self._floor = self._picture = None
 
     def __enter__(self):
         self._video.__enter__()
@@ -69,6 +71,10 @@ class Film:
         if self._camera is None:
             bounds = self._solids.bounds(frame, scene.emitters)
             self._camera = Camera.fit(*bounds, aspect=self._size[0] / self._size[1])
+            self._floor = bounds[0][2]
+        # A floor under what is there now would jump; but nothing may sink into it.
+        self._floor = min(self._floor, frame.bounds()[0][2])
+        frame = replace(frame, floor_z=float(self._floor))
         self._picture = render(frame, self._camera, self._size)
         self._video.add(self._picture)
 

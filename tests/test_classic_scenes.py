@@ -114,3 +114,94 @@ def test_stirred_liquid_goes_round_with_the_stirrer_and_stays_in_the_cup():
     # The surface is higher at the rim than in the middle.
     outside, inside = z[r > 0.03], z[r < 0.012]
     assert np.percentile(outside, 98) > np.percentile(inside, 98)
+
+
+def test_a_fountain_rises_as_high_as_its_speed_says_and_drains_away():
+    sim = sph_ros.Simulation("fountain")
+    sim.advance(0.8)  # what rose first is down again
+    before = sim.statistics()["particle_count"]
+    sim.advance(0.3)
+    facts = sim.statistics()
+    assert sim.positions[:, 2].max() == pytest.approx(0.004 + 2.4**2 / (2 * 9.81), abs=0.006)
+    assert facts["removed_particles"] == facts["emitted_particles"] - facts["particle_count"] > 1000
+    assert facts["particle_count"] == pytest.approx(before, rel=0.05)
+    assert (np.diff(sim.ids.astype(int)) > 0).all()
+
+
+def test_oil_that_starts_beside_water_ends_on_top_of_it():
+    sim = sph_ros.Simulation(described("oil_water", spacing=0.009, support_radius=0.0234))
+    oil = sim.families == 1
+    assert oil.sum() == 600 == (~oil).sum()
+    masses = sim.densities  # of equal volumes
+    assert np.median(masses[oil]) / np.median(masses[~oil]) == pytest.approx(0.75, rel=0.03)
+    sim.advance(2.5)
+    z = sim.positions[:, 2]
+    assert (z[oil] > np.median(z)).mean() > 0.93 and (z[~oil] < np.median(z)).mean() > 0.93
+    assert sim.statistics()["lost_particles"] == 0
+
+
+def test_honey_coils():
+    """Just above the plate the thread goes round and round, one way."""
+    scene = described("honey_spoon", spacing=0.002)
+    del scene["liquid"]  # what stays in the spoon
+    sim = sph_ros.Simulation(scene)
+    angles = []
+    while sim.time < 1.5:
+        sim.step()
+        x = sim.positions
+        thread = (x[:, 2] > 0.010) & (x[:, 2] < 0.016)
+        if sim.time > 0.5 and thread.any():
+            angles.append(math.atan2(*x[thread, 1::-1].mean(axis=0)))
+    turned = np.unwrap(angles) / (2 * math.pi)
+    assert abs(turned[-1] - turned[0]) > 3
+    back = np.diff(turned[:: len(turned) // 20]) * np.sign(turned[-1] - turned[0])
+    assert back.min() > -0.15
+
+
+def test_cream_stands_as_it_was_laid():
+    sim = sph_ros.Simulation(described("cream", spacing=0.003))
+    sim.advance(2.3)  # the plate has come to rest
+
+    def heap():
+        x = sim.positions.astype(np.float64)
+        x[:, 2] -= sim.solid("plate").position[2] + 0.004
+        return np.percentile(x, 99, axis=0) - np.percentile(x, 1, axis=0)
+
+    laid = heap()
+    sim.advance(0.6)
+    np.testing.assert_allclose(heap(), laid, rtol=0.03)
+    facts = sim.statistics()
+    assert laid[2] > 0.02 and facts["mean_speed"] < 0.01
+    assert facts["particle_count"] == facts["emitted_particles"] > 600
+
+
+def test_a_jelly_that_fell_stands_in_its_shape():
+    sim = sph_ros.Simulation(described("jelly", spacing=0.006))
+    height = np.ptp(sim.positions[:, 2])
+    flattest = height
+    while sim.time < 0.8:
+        sim.step()
+        flattest = min(flattest, np.ptp(sim.positions[:, 2]))
+    assert flattest < 0.9 * height
+    assert np.ptp(sim.positions[:, 2]) == pytest.approx(height, rel=0.1)
+    x, _, z = sim.positions.T
+    assert np.ptp(x[z < 0.02]) > 1.3 * np.ptp(x[z > 0.036])  # its two tiers
+
+
+def test_a_ball_that_falls_into_water_throws_up_a_jet_and_sinks():
+    sim = sph_ros.Simulation(described("ball_splash", spacing=0.015))
+    level = sim.positions[:, 2].max()
+    highest = 0.0
+    while sim.time < 2.0:
+        sim.step()
+        x = sim.positions
+        if 0.2 < sim.time < 0.5:
+            middle = np.hypot(x[:, 0], x[:, 1]) < 0.04
+            highest = max(highest, x[middle, 2].max(initial=0.0))
+    assert highest > level + 0.06  # twice the jet's width above the water
+    ball = sim.solid("ball")
+    assert ball.position[2] == pytest.approx(0.035, abs=0.005)
+    assert sim.statistics()["lost_particles"] == 0
+    displaced = 4 / 3 * math.pi * 0.035**3 / 0.3**2
+    z = np.percentile(x[:, 2], 98)
+    assert z == pytest.approx(level + displaced, abs=0.012)

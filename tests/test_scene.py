@@ -75,6 +75,12 @@ EXPECTED_PARTICLES = {
     "drop_box": (2100, 2300),
     "drops_merge": (2700, 3200),
     "floating_boat": (6500, 8500),
+    "ball_splash": (10_800, 10_800),
+    "cream": (0, 0),
+    "fountain": (0, 0),
+    "honey_spoon": (300, 600),  # what stays in the spoon
+    "jelly": (1900, 2200),
+    "oil_water": (4500, 4500),
     "pour_glass": (0, 0),  # all of it is poured
     "rain_2d": (0, 0),  # all of it rains
     "resting_column": (2000, 2000),

@@ -48,7 +48,7 @@ def cup(radius=0.04, height=0.07):
     return trimesh.util.concatenate([bowl, trimesh.Trimesh(points, strip, process=False)])
 
 
-def spoon(length=0.03, width=0.02, depth=0.007, handle=0.08):
+def spoon(length=0.03, width=0.02, depth=0.007, handle=0.05):
     """A spoon whose bowl is half an ellipsoid about the origin, open upwards, handle along x."""
     turn = np.radians(np.linspace(0, 360, 29)[:-1])
     rows = [np.array([[0.0, 0.0, -depth]])]

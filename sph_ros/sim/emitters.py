@@ -69,6 +69,8 @@ class Emitters:
             if begin >= end:
                 continue
             progress, jet = self._progress[index], self._jets[index]
+            if emitter.nozzle > 0.0 and self._counts[index] != emitter.limit:
+                self._hold(emitter, jet, fluid)
             progress += (end - begin) / jet.period
             room = fluid.capacity - len(fluid)
             if emitter.limit is not None:
@@ -93,6 +95,15 @@ class Emitters:
                 room -= len(due)
             np.minimum(progress, MOST_OVERDUE, out=progress)
         return next_id
+
+    def _hold(self, emitter, jet, fluid):
+        """Give the liquid in a nozzle the speed of its jet."""
+        offsets = fluid.positions - np.array(emitter.position, np.float32)
+        along = offsets @ jet.direction
+        across = offsets - along[:, None] * jet.direction
+        inside = (along > -self._scene.spacing) & (along < emitter.nozzle)
+        inside &= np.linalg.norm(across, axis=1) < emitter.radius + self._scene.spacing
+        fluid.velocities[inside] = jet.speed * jet.direction
 
     def _free(self, places, fluid, solids):
         """Which places are clear of solids and particles, (M,) bool."""

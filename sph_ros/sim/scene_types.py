@@ -92,6 +92,8 @@ class Emitter:
         from_time: first moment [s]; key `from` in the file.
         until: last moment [s].
         limit: most particles it ever emits, None for no limit.
+        nozzle: so far in front of the opening the liquid keeps the jet's speed, as it does in a
+            narrow nozzle [m]; without one nothing holds a thick liquid that hangs from the opening.
     """
 
     position: Vector = quantity("m", low=-1e4, high=1e4)
@@ -102,6 +104,7 @@ class Emitter:
     from_time: float = quantity("s", 0.0, low=0.0, high=1e9)
     until: float = quantity("s", math.inf, low=0.0)
     limit: int | None = quantity("particles", None, low=1, high=1e9)
+    nozzle: float = quantity("m", 0.0, low=0.0, high=100.0)
 
     def __post_init__(self):
         """Refuse a jet without direction or strength, and one that never runs."""
