@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 NAME = "sph_ros"
 # Resolved, because colcon build --symlink-install runs a link to this file.
 ROOT = Path(__file__).resolve().parent
-SHARED_FOLDERS = ("scenes", "launch", "rviz")
+SHARED_FOLDERS = ("scenes", "launch", "rviz", "foxglove")
 
 # Jazzy's rclpy from PyPI, for machines without an apt-installed ROS. Never in install_requires: on
 # a ROS machine these come from apt, and the names ros-<package> are shared among ROS releases.

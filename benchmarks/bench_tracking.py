@@ -42,6 +42,7 @@ from sph_ros.tracking.tracker import Tracker, TrackerSettings  # noqa: E402
 
 BAGS = ("fr1_xyz_mocap_mcap", "fr1_xyz_rgbdslam_db3", "tumvi_room1_mcap")
 FILTERS = ("none", "one_euro", "kalman")
+PLOTTED = 15.0  # [s]
 REACH = 0.05  # [m], standard deviation along the liveliest axis
 
 
@@ -84,15 +85,20 @@ def row(times, truth, filter, moving=None, **disturbance):
     )
 
 
-def compare(bags, seconds):
-    """Print the table."""
-    head = "filter      rms mm  max mm rms deg  still mm/deg  lag frames"
-    sources = {"synthetic hand": (*truth_of_hand(seconds),)}
+def find_sources(bags, seconds):
+    """Name -> (times, truth, moving) of the synthetic hand and of the recordings that are there."""
+    sources = {"synthetic hand": truth_of_hand(seconds)}
     for name in BAGS:
         try:
             sources[name] = (*recorded_truth(bags / name, seconds), None)
         except BagError as error:
             print(f"without {name}: {error}")
+    return sources
+
+
+def compare(sources):
+    """Print the table."""
+    head = "filter      rms mm  max mm rms deg  still mm/deg  lag frames"
     for text, disturbance in (("clean", {}), ("disturbed", {"drop": 0.1, "outliers": 0.02})):
         for name, (times, truth, moving) in sources.items():
             print(f"\n{name}, {text}, {times[-1]:.0f} s\n{head}")
@@ -100,28 +106,34 @@ def compare(bags, seconds):
                 print(row(times, truth, filter, moving, **disturbance), flush=True)
 
 
-def plot(path, seconds):
-    """The x coordinate of all filters over a part of the disturbed synthetic hand."""
+def plot(path, sources):
+    """Heights and errors of all filters, disturbed: the synthetic hand and the first recording."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    times, truth, _ = truth_of_hand(seconds)
-    figure, axes = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
-    for filter, color in zip(FILTERS, ("0.7", "tab:orange", "tab:blue"), strict=True):
-        results = track_hand(times, truth, filter, drop=0.1, outliers=0.02, seed=3)
-        off = errors(results, truth)
-        missing = np.full(3, np.nan)
-        places = np.array([missing if r.pose is None else r.pose.position for r in results])
-        axes[0].plot(times, 1e3 * places[:, 2], color=color, lw=1, label=filter)
-        axes[1].semilogy(times, 1e3 * np.linalg.norm(off[:, :3], axis=1), color=color, lw=0.8)
-    axes[0].plot(times, [1e3 * p.position[2] for p in truth], "k--", lw=0.8, label="truth")
-    axes[0].set_ylabel("height [mm]")
-    axes[0].legend(loc="upper right")
-    axes[1].set_ylabel("position error [mm]")
-    axes[1].set_xlabel("time [s]")
-    figure.savefig(path, dpi=120)
+    shown = list(sources.items())[:2]
+    figure, axes = plt.subplots(
+        2, len(shown), figsize=(5 * len(shown), 5), sharex=True, squeeze=False, layout="constrained"
+    )
+    for (name, (times, truth, _)), (above, below) in zip(shown, axes.T, strict=True):
+        part = times <= times[0] + PLOTTED
+        times, truth = times[part], [p for p, keep in zip(truth, part, strict=True) if keep]
+        heights = 1e3 * np.array([pose.position[2] for pose in truth])
+        for filter, color in zip(FILTERS, ("0.7", "tab:orange", "tab:blue"), strict=True):
+            results = track_hand(times, truth, filter, drop=0.1, outliers=0.02, seed=3)
+            off = errors(results, truth)
+            above.plot(times, heights + 1e3 * off[:, 2], color=color, lw=1, label=filter)
+            below.semilogy(times, 1e3 * np.linalg.norm(off[:, :3], axis=1), color=color, lw=0.8)
+        above.plot(times, heights, "k--", lw=0.8, label="truth")
+        margin = 0.2 * np.ptp(heights) + 5.0
+        above.set(title=name, ylim=(heights.min() - margin, heights.max() + margin))
+        below.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("height [mm]")
+    axes[1, 0].set_ylabel("position error [mm]")
+    axes[0, 0].legend(loc="upper right", fontsize="small")
+    figure.savefig(path, dpi=90)
     print(f"plot: {path}")
 
 
@@ -174,9 +186,10 @@ def main():
     parser.add_argument("--seconds", type=float, default=20.0, help="of each trajectory (20)")
     options = parser.parse_args()
     time_pictures()
-    compare(options.bags, options.seconds)
+    sources = find_sources(options.bags, options.seconds)
+    compare(sources)
     if options.plot:
-        plot(options.plot, options.seconds)
+        plot(options.plot, sources)
 
 
 if __name__ == "__main__":

@@ -71,11 +71,15 @@ def with_wall(scene, position, height):
     return dataclasses.replace(scene, solids=tuple(solids))
 
 
+def scene_of(case: Case):
+    """The scene with the wall and the solver of a case."""
+    scene = with_wall(load_scene("dam_house_2d"), case.position, case.height)
+    return scene if case.solver is None else dataclasses.replace(scene, solver=case.solver)
+
+
 def run_case(case: Case) -> Outcome:
     """Run a case to its end."""
-    scene = with_wall(load_scene("dam_house_2d"), case.position, case.height)
-    if case.solver is not None:
-        scene = dataclasses.replace(scene, solver=case.solver)
+    scene = scene_of(case)
     sim = Simulation(scene)
     near, reached, wet_from = TOUCH * scene.spacing, 0.0, None
     while sim.time < (case.seconds or scene.duration) - 0.5 * sim.time_step:

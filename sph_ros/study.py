@@ -18,11 +18,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sph_ros.dam_house import BEGIN, Case, Outcome, answer, run_case, table
+from sph_ros.dam_house import BEGIN, Case, Outcome, answer, run_case, scene_of, table
 from sph_ros.recording import ResultFolder
 from sph_ros.render.plots import plot_study
-from sph_ros.sim.kernels import ensure_compiled
-from sph_ros.sim.scene import load_scene
+from sph_ros.sim.kernels import ensure_compiled, needs
 from sph_ros.waiting import preparing
 
 #: Scenes that a question belongs to.
@@ -81,7 +80,7 @@ def study(
     for case in cases:
         _check(case)
     with preparing():
-        ensure_compiled(solver or load_scene(scene).solver)
+        ensure_compiled(needs(scene_of(cases[0])))
     with ResultFolder(out) as folder, _executor(executor, workers, len(cases)) as pool:
         outcomes = _run_all(pool, cases, progress)
         _write_csv(folder.path / "study.csv", outcomes)

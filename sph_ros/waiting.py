@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first run compiles for up to a minute: do it before anything moves, and say so meanwhile."""
+"""The first run compiles for half a minute: do it before anything moves, and say so meanwhile."""
 
 import sys
 import threading
 from contextlib import contextmanager
 
 from sph_ros.core.surface import extract_surface
+from sph_ros.sim import kernels
 
 #: Between two reports [s]; what takes less is not worth a word.
 PERIOD = 2.0
@@ -18,6 +19,14 @@ def warm_up(sim):
     scene = sim.scene
     extract_surface(sim.positions, scene.spacing, scene.support_radius, dimension=scene.dimension)
     sim.reset()
+
+
+def words(seconds):
+    """What a program is at that has been preparing for so long [s], and how far it is."""
+    compiled = kernels.progress()
+    if not compiled:
+        return f"preparing, the first run compiles for half a minute: {seconds:.0f} s"
+    return f"compiling for this machine, the first time only: {compiled}, {seconds:.0f} s"
 
 
 @contextmanager
@@ -53,12 +62,12 @@ def preparing():
     told = []
 
     def tell(seconds):
-        told.append(f"preparing, the first run compiles for up to a minute ... {seconds:.0f} s")
-        print(f"\r{told[-1]}", end="", file=sys.stderr, flush=True)
+        told.append(words(seconds))
+        print(f"\r{told[-1]:<{len(told[0])}}", end="", file=sys.stderr, flush=True)
 
     try:
         with tell_while_waiting(tell):
             yield
     finally:
         if told:
-            print(f"\r{' ' * len(told[-1])}\r", end="", file=sys.stderr, flush=True)
+            print(f"\r{' ' * max(map(len, told))}\r", end="", file=sys.stderr, flush=True)

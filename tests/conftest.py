@@ -33,7 +33,7 @@ def compiled_tracker():
 
 @pytest.fixture(scope="session")
 def compiled_liquid():
-    """The same for the kernels of the simulation."""
+    """The same for the kernels of most scenes."""
     from sph_ros.sim.kernels import ensure_compiled
 
-    ensure_compiled()
+    ensure_compiled(["relaxation", "incompressible"])

@@ -102,6 +102,7 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
         work.sums.density,
         work.contacts,
         np.float32(1.0),
+        np.float32(1.0),
         np.float32(0.01),
         work.targets,
     )
@@ -317,6 +318,31 @@ def test_a_marker_that_jumps_does_not_splatter_the_drop(solver):
     links = coo_array((np.ones(len(near)), near.T), shape=(sim.particle_count,) * 2)
     assert connected_components(links, directed=False)[0] == 1
     assert sim.statistics()["max_speed"] < 0.5
+
+
+def test_a_column_of_many_fine_layers_collapses_without_bursting():
+    """160 layers: what one layer more or less is wrong adds up over all of them."""
+    depth = 0.32
+    sim = sph_ros.Simulation(
+        {
+            "solver": "incompressible",
+            "dimension": 2,
+            "spacing": 0.002,
+            "liquid": [{"box": {"min": [0, -0.05, 0], "max": [0.04, 0.05, depth]}}],
+            "solids": [
+                {
+                    "name": "tank",
+                    "container": {"box": {"min": [0, -0.05, 0], "max": [0.08, 0.05, 0.4]}},
+                }
+            ],
+        }
+    )
+    fastest = 0.0
+    while sim.time < 0.25:
+        sim.step()
+        fastest = max(fastest, sim.statistics()["max_speed"])
+    # What meets a wall shoots up, but nothing is twice as fast as water that fell all the way.
+    assert 1.0 < fastest < 2 * math.sqrt(2 * 9.81 * depth)
 
 
 def test_a_collapsing_column_runs_as_fast_as_the_measured_one(shared_data, solver):

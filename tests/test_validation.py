@@ -38,6 +38,12 @@ def test_relaxation_pushes_a_plate_with_the_viscosity_asked_for():
     assert row.passed, row
 
 
+def test_honey_is_pushed_through_a_channel_at_the_pace_of_the_piston():
+    """Pistons hit the liquid at full speed; it neither bursts nor flows as a plug."""
+    (row,) = checks.run_check("poiseuille", Case("incompressible", quick=True)).rows
+    assert row.passed, row
+
+
 def fake(monkeypatch, **outcomes):
     """Checks that answer at once: name -> error, or an exception."""
 

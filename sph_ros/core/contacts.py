@@ -145,7 +145,7 @@ def find_contacts(
     """
     for chunk in prange(chunks):
         find_contacts_of_chunk(
-            chunk,
+            np.int64(chunk),
             positions,
             clearance,
             shapes,
@@ -182,7 +182,7 @@ def pressure_reactions(positions, contacts, motion, sums, pressures, tension, sc
                 t = contacts.terms[k]
                 add_reaction(
                     reactions,
-                    chunk,
+                    np.int64(chunk),
                     contacts.solid[k],
                     motion,
                     positions[i, 0],
@@ -229,7 +229,7 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                 velocities[i, 2] -= share * sz
                 add_reaction(
                     reactions,
-                    chunk,
+                    np.int64(chunk),
                     contacts.solid[k],
                     motion,
                     positions[i, 0],
@@ -463,7 +463,7 @@ def keep_outside(
     """
     for chunk in prange(reactions.shape[0]):
         squeezed[chunk] += keep_chunk_outside(
-            chunk,
+            np.int64(chunk),
             starts,
             ends,
             origins,

@@ -267,13 +267,13 @@ def distance_and_leaf(shapes, solid, x, y, z):
     """
     d0 = d1 = d2 = d3 = _FAR
     n0 = n1 = n2 = n3 = np.int64(0)
-    for node in range(shapes.solid_start[solid], shapes.solid_start[solid + 1]):
+    for node in range(np.int64(shapes.solid_start[solid]), np.int64(shapes.solid_start[solid + 1])):
         op = shapes.node_op[node]
         if op < UNION:
             px, py, pz = to_leaf(shapes, node, x, y, z)
             distance, _, _, _ = leaf_distance(shapes, node, px, py, pz)
             d3, d2, d1, d0 = d2, d1, d0, distance * shapes.node_sign[node]
-            n3, n2, n1, n0 = n2, n1, n0, np.int64(node)
+            n3, n2, n1, n0 = n2, n1, n0, node
         else:
             if (d1 < d0) == (op == UNION):
                 d0, n0 = d1, n1

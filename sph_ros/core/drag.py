@@ -6,6 +6,7 @@ torn from the wall: a liquid thick enough to be solved implicitly would slip bet
 layers.
 """
 
+import numpy as np
 from numba import prange
 
 from sph_ros.core.contacts import FRACTION, NORMAL, SURFACE_VELOCITY, add_reaction
@@ -75,7 +76,7 @@ def drag_reactions(positions, contacts, motion, rate, scale, velocities, reactio
                 force = scale * rate * terms[k, FRACTION]
                 add_reaction(
                     reactions,
-                    chunk,
+                    np.int64(chunk),
                     contacts.solid[k],
                     motion,
                     positions[i, 0],

@@ -315,7 +315,7 @@ def pressure_reactions(positions, contacts, motion, scale, state, reactions):
                 t = contacts.terms[k]
                 add_reaction(
                     reactions,
-                    chunk,
+                    np.int64(chunk),
                     contacts.solid[k],
                     motion,
                     positions[i, 0],

@@ -84,6 +84,7 @@ def density_targets(
     density,
     contacts,
     share,
+    rest,
     time_step,
     targets,
 ):
@@ -101,8 +102,8 @@ def density_targets(
         density: at `positions`, relative to rest [-], (N,).
         contacts: with the solids' velocities.
         share: of an excess of density up to `MILD` that is to be taken back in this step [-],
-            float32; what is above goes at once. A lack of density counts in full: so far a particle
-            may be approached.
+            float32. A lack of density counts in full: so far a particle may be approached.
+        rest: share of what is above `MILD` [-], float32.
         time_step: [s], float32.
         targets: [-], (N,); written.
     """
@@ -130,7 +131,7 @@ def density_targets(
             grown += u * u - us[k] * us[k]
         excess = density[i] - one
         if excess > zero:
-            excess = share * min(excess, MILD) + max(excess - MILD, zero)
+            excess = share * min(excess, MILD) + rest * max(excess - MILD, zero)
         for k in range(contacts.start[i], contacts.end[i]):
             t = contacts.terms[k]
             for axis in range(3):

@@ -222,7 +222,7 @@ def stop_at_sheets(starts, ends, clearance, sheets, motion, margin, scale, react
     """
     for chunk in prange(reactions.shape[0]):
         stop_chunk_at_sheets(
-            chunk, starts, ends, clearance, sheets, motion, margin, scale, reactions
+            np.int64(chunk), starts, ends, clearance, sheets, motion, margin, scale, reactions
         )
 
 

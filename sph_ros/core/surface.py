@@ -515,11 +515,10 @@ def _blur_pass(source, flat, scratch, target):  # the last two are written
                 )
 
 
-@kernel
 def _blur(source, passes, flat, scratch, target):  # the last two are written
     """Several binomial passes from source to target."""
     if passes == 0:
-        target[:] = source
+        np.copyto(target, source)
     for n in range(passes):
         _blur_pass(source if n == 0 else target, flat, scratch, target)
 

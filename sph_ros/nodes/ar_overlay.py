@@ -41,7 +41,7 @@ from sph_ros.tracking.camera import CameraError
 from sph_ros.tracking.drawing import draw_notes
 from sph_ros.tracking.images import to_bgr
 from sph_ros.tracking.se3 import pose_from_quaternion
-from sph_ros.waiting import tell_while_waiting
+from sph_ros.waiting import tell_while_waiting, words
 
 #: How often it is looked whether anybody listens [s].
 ATTENTION_PERIOD = 0.2
@@ -111,9 +111,7 @@ class ArOverlay(Node):
         super().destroy_node()
 
     def _tell(self, seconds):
-        self.get_logger().info(
-            f"preparing, the first run compiles for up to a minute: {seconds:.0f} s"
-        )
+        self.get_logger().info(words(seconds))
 
     # ---------------------------------------------------------------- what comes
 

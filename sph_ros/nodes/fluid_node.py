@@ -43,7 +43,7 @@ from sph_ros.nodes.surface_worker import SurfaceWorker
 from sph_ros.nodes.unheard import UnheardPoses
 from sph_ros.sim.scene import SceneError, load_scene
 from sph_ros.sim.simulation import Simulation
-from sph_ros.waiting import tell_while_waiting, warm_up
+from sph_ros.waiting import tell_while_waiting, warm_up, words
 
 #: Warnings of one kind are at least so far apart [s].
 WARNING_PERIOD = 5.0
@@ -104,9 +104,7 @@ class FluidNode(Node):
     # ---------------------------------------------------------------- start
 
     def _tell(self, seconds):
-        self.get_logger().info(
-            f"preparing, the first run compiles for up to a minute: {seconds:.0f} s"
-        )
+        self.get_logger().info(words(seconds))
 
     def _introduce(self):
         sim = self._runner.sim

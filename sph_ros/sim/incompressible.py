@@ -2,12 +2,14 @@
 """The incompressible solver: the order of a step."""
 
 import dataclasses
+import math
 
 import numpy as np
 
 from sph_ros.core import neighbors as search
 from sph_ros.core import projection as project
 from sph_ros.core import relaxation as relax
+from sph_ros.sim.liquid import initial_length
 from sph_ros.sim.pressure import Goal
 from sph_ros.sim.pressure_solver import PressureSolver
 from sph_ros.sim.scales import MELTING_TIME, expected_speed, packing, viscous_rate
@@ -15,13 +17,25 @@ from sph_ros.sim.scales import MELTING_TIME, expected_speed, packing, viscous_ra
 #: Share of the support radius that the fastest expected particle crosses in a step.
 COURANT = 0.6
 
-#: Share of an excess of density that one step takes back. All of it at once would turn every error
-#: of the iteration into velocity.
+#: Share of an excess of density that a step of the longest stable length takes back; shorter ones
+#: take back less, in proportion, since a way that is made in less time is a higher speed. All of it
+#: at once would turn every error of the iteration into velocity.
 CORRECTED = 0.4
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
 ERROR_SHARE, CALM = 0.4, 0.05
+
+#: Largest mean density error after a step, as a share of (h / L)^2 with L the depth of the liquid
+#: (where there is no gravity its length). An error e that is as long as the liquid is paid back by
+#: a pressure of about rho e (L / (pi dt))^2. It is stable up to rho (h / dt)^2 / 4 (`SURGE`), so
+#: the finer the liquid is resolved the less error it stands, however short the step.
+STEEPEST = 1.0
+
+#: Share of the support radius that sqrt(2 p / rho) crosses in a substep, with p the pressure that
+#: all but `PEAKS` of the particles stay below. A pressure is stiff against shear like p / h^2;
+#: particles that are pushed, not dropped, have one that their speed says nothing about.
+SURGE, PEAKS = 0.7, 0.005
 
 #: Particles below this density are at a free surface; there is one if so many are [-].
 SURFACE_DENSITY, SURFACE_SHARE = 0.85, 0.01
@@ -35,6 +49,32 @@ class IncompressibleSolver(PressureSolver):
     """Pressures that hold the density of the next positions; see `core.projection`."""
 
     courant = COURANT
+
+    def __init__(self, scene, solids, depth):
+        """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
+        super().__init__(scene, solids, depth)
+        self._pressed = 0.0
+        length = depth or initial_length(scene)
+        self._most_error = STEEPEST * (scene.support_radius / max(length, 1e-9)) ** 2
+
+    def stable_time_step(self):
+        """A step that keeps the scene stable [s], and what bounds it."""
+        self._longest, reason = super().stable_time_step()
+        return self._longest, reason
+
+    def longest_step(self):
+        """The longest substep [s] that the present pressures allow."""
+        speed = math.sqrt(2.0 * self._pressed / self.scales.rest_density)
+        return SURGE * float(self._h) / speed if speed > 0.0 else math.inf
+
+    def state(self):
+        """What a later step depends on beside the fluid, for a snapshot."""
+        return {**super().state(), "pressed": self._pressed}
+
+    def set_state(self, state):
+        """Inverse of `state`."""
+        super().set_state(state)
+        self._pressed = state["pressed"]
 
     def set_material(self, material):
         """Use another material from the next substep on."""
@@ -125,6 +165,29 @@ class IncompressibleSolver(PressureSolver):
         self._clock("densities")
         self._listed = fluid
 
+    def _apply_viscosity(self, fluid, time_step):
+        """Viscosity and friction; what is thick rubs with the speeds that it is about to have.
+
+        Velocities lack what gravity and pressure will add in this step. Where friction holds the
+        liquid within a step, that is no longer little: it would flow on as a plug. So the last
+        pressures and gravity act first and are taken off again (the incremental splitting of Van
+        Kan 1986).
+        """
+        if not self._rates(time_step).implicit:
+            super()._apply_viscosity(fluid, time_step)
+            return
+        work, unit = self._work, self._pressure_unit(time_step)
+        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        work.cohesive[:] = self._gravity * np.float32(time_step**2)
+        # `starts` has no other use between the lists and the next positions.
+        relax.pressure_displacements(
+            work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.starts
+        )
+        work.starts *= np.float32(1.0 / time_step)
+        fluid.velocities += work.starts
+        super()._apply_viscosity(fluid, time_step)
+        fluid.velocities -= work.starts
+
     def _project(self, fluid, time_step):
         """Displacements in this step under all forces, pressures included."""
         work = self._work
@@ -138,6 +201,7 @@ class IncompressibleSolver(PressureSolver):
         dt = np.float32(time_step)
         project.push(fluid.velocities, self._gravity, dt, work.cohesive)
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        pace = min(time_step / self._longest, 1.0)
         relax.pressure_displacements(
             work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.displacements
         )
@@ -149,14 +213,19 @@ class IncompressibleSolver(PressureSolver):
             work.pairs,
             work.sums.density,
             work.contacts,
-            np.float32(CORRECTED),
+            np.float32(CORRECTED * pace),
+            np.float32(pace),
             dt,
             work.targets,
         )
         allowed = self._material.compression
-        goal = Goal(CALM * allowed, ERROR_SHARE, allowed)
+        most = min(allowed, self._most_error)
+        goal = Goal(min(CALM * allowed, ERROR_SHARE * most), ERROR_SHARE, most)
         self._iterate(work.targets, np.float32(0.0), goal, time_step, displaced=True)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
+        if len(fluid):
+            rank = int((1.0 - PEAKS) * (len(fluid) - 1))
+            self._pressed = float(np.partition(fluid.pressures, rank)[rank])
         self._push_bodies(self._solids.bodies.inertias.centre)
 
     def _move(self, fluid, time_step):

@@ -1,122 +1,262 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compile all kernels once, in a process of its own.
+"""Compile the kernels that a scene needs once, in processes of their own.
 
 The process that compiles a kernel runs another machine code of it than processes that load it from
 numba's cache: linked functions are optimised once more for the cache, and sums may then be taken in
 another order. Both are right, but their last bits differ. So no process that simulates compiles:
-the first one has a child do it, and then loads what all later ones load. Only what a scene needs is
-compiled: the kernels of its solver.
+the first one has two children do it, and then loads what all later ones load.
 """
 
+import fcntl
+import itertools
 import os
 import subprocess
 import sys
 import tempfile
+import threading
+from contextlib import contextmanager
 from pathlib import Path
 
 from numba import config
+from numba.core import caching, event
 
 from sph_ros.core.jit import KERNELS
+from sph_ros.sim.scene_types import LIQUID_SOLVERS, SOLVERS
+from sph_ros.sim.shape_types import Mesh, OpenSurface
 
-#: Set for the child, which must not have children of its own.
+#: Set for the children, which must not have children of their own.
 COMPILING = "SPH_ROS_COMPILING"
 
 LONGEST = 900.0  # [s]
+
+#: What scenes may have beside a solver; each has kernels of its own.
+FEATURES = ("bodies", "sheets", "meshes", "springs")
+
+#: Functions that the first scene of all needs, about: for reports of progress.
+FUNCTIONS = 160
 
 _SCENE = {
     "spacing": 0.02,
     "material": "honey",
     "liquid": [{"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}}],
-    "solids": [
-        {"name": "tank", "container": {"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.3]}}},
-        {
-            "name": "ball",
-            "sphere": {"radius": 0.02},
-            "pose": {"position": [0.05, 0.05, 0.2]},
-            "control": "topic",
-        },
-        {
-            "name": "cube",
-            "box": {"size": [0.03, 0.03, 0.03]},
-            "pose": {"position": [0.05, 0.05, 0.12]},
-            "control": "free",
-            "density": 500.0,
-        },
-    ],
     "emitters": [
         {"position": [0.05, 0.05, 0.27], "radius": 0.01, "speed": 2.0, "from": 0.0, "limit": 3}
     ],
     "sinks": [{"plane": {"offset": -1.0}}],
 }
 
-#: A triangle in the middle of the liquid.
+_SOLIDS = [
+    {"name": "tank", "container": {"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.3]}}},
+    {
+        "name": "ball",
+        "sphere": {"radius": 0.02},
+        "pose": {"position": [0.05, 0.05, 0.2]},
+        "control": "topic",
+    },
+]
+
+_BODY = {
+    "name": "cube",
+    "box": {"size": [0.03, 0.03, 0.03]},
+    "pose": {"position": [0.05, 0.05, 0.12]},
+    "control": "free",
+    "density": 500.0,
+}
+
+#: A triangle in the middle of the liquid, and a tetrahedron above it.
 _SHEET = "v 0 0 0.05\nv 0.1 0 0.05\nv 0 0.1 0.05\nf 1 2 3"
+_MESH = (
+    "v 0.02 0.02 0.12\nv 0.08 0.02 0.12\nv 0.02 0.08 0.12\nv 0.02 0.02 0.18\n"
+    "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4"
+)
+
+#: Functions that the children have compiled so far.
+_compiled = 0
 
 
-def compile_for(scene):
-    """Have the kernels compiled that `scene` needs, if they are not yet."""
-    ensure_compiled(scene.solver, scene.material.elasticity > 0.0)
+def progress():
+    """How far the compilation is, in words; empty where nothing is compiled."""
+    return f"{_compiled} of about {max(FUNCTIONS, _compiled)} functions" if _compiled else ""
 
 
-def ensure_compiled(solver="relaxation", springs=False):
-    """Have the kernels of a solver compiled if they are not yet.
+def needs(scene):
+    """Names of what has to be compiled for a `Scene`."""
+    shapes = [solid.shape for solid in scene.solids]
+    drawn = [*shapes, *(part.shape for part in scene.liquid)]
+    has = {
+        "bodies": any(solid.control == "free" for solid in scene.solids),
+        "sheets": any(isinstance(shape, OpenSurface) for shape in shapes),
+        "springs": scene.material.elasticity > 0.0 and scene.solver in LIQUID_SOLVERS,
+        "meshes": any(_contains_mesh(shape) for shape in drawn),
+    }
+    return [scene.solver, *(f"{scene.solver}+{name}" for name in FEATURES if has[name])]
 
-    That takes a minute or two for the first solver, which compiles what all share, some seconds for
-    another one, and a moment later on. Where it fails, say because nothing can be cached, this
-    process compiles for itself.
+
+def _contains_mesh(shape):
+    parts = [*getattr(shape, "of", ()), *filter(None, [getattr(shape, "shape", None)])]
+    return isinstance(shape, Mesh) or any(_contains_mesh(part) for part in parts)
+
+
+def everything():
+    """Names of all that any scene may need."""
+    pairs = itertools.product(SOLVERS, FEATURES)
+    return [
+        *SOLVERS,
+        *(f"{s}+{name}" for s, name in pairs if name != "springs" or s in LIQUID_SOLVERS),
+    ]
+
+
+def ensure_compiled(names=None):
+    """Have kernels compiled if they are not yet; half a minute then, a moment otherwise.
+
+    Where that fails, say because nothing can be cached, this process compiles for itself.
 
     Args:
-        solver: its name in scenes.
-        springs: those of elastic materials too.
+        names: from `needs`; all unless given.
     """
-    if config.DISABLE_JIT or COMPILING in os.environ or _mark(solver, springs).exists():
+    if config.DISABLE_JIT or COMPILING in os.environ:
         return
-    command = [sys.executable, "-m", "sph_ros.sim.kernels", solver, *(["springs"] * springs)]
-    root = str(Path(__file__).parents[2])
-    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, COMPILING: "1", "PYTHONPATH": os.pathsep.join(paths)}
+    names = everything() if names is None else names
+    if not _missing(names):
+        return
     try:
-        subprocess.run(
-            command,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=LONGEST,
-            check=True,
-        )
+        with _alone():
+            missing = _missing(names)  # another process may have been at it
+            for jobs in _rounds(missing):
+                _run_children(jobs)
     except (OSError, subprocess.SubprocessError):
         return
 
 
-def _mark(solver, springs):
-    """The file that is there once the kernels are."""
-    return Path(KERNELS) / f"complete_{solver}{'_springs' * springs}"
+def _mark(name):
+    """File that says that what `name` needs is compiled."""
+    return Path(KERNELS, f"compiled.{name}")
 
 
-def main():
-    """Take every way through the kernels of a solver once, then leave the mark."""
+def _missing(names):
+    return [name for name in names if not _mark(name).exists()]
+
+
+@contextmanager
+def _alone():
+    """Wait until no other process compiles these kernels, then keep others waiting."""
+    with open(Path(KERNELS, "lock"), "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _rounds(names):
+    """Lists of names for two processes at a time, in an order that leaves little to do twice.
+
+    A scene without solids needs about half of what one with solids does, and other halves of that
+    come first in the two: together they take little more than half the time.
+    """
+    solvers = [name for name in names if name in SOLVERS]
+    features = [name for name in names if name not in SOLVERS]
+    if solvers:
+        yield [solvers[0]], [f"{solvers[0]}-solids"]
+    for rest in (solvers[1:], features):
+        yield rest[::2], rest[1::2]
+
+
+def _run_children(jobs):
+    """Compile lists of names, each in a process, and count what they report."""
+    children = [_start_child(names) for names in jobs if names]
+    counters = [threading.Thread(target=_count, args=(child,), daemon=True) for child in children]
+    try:
+        for counter in counters:
+            counter.start()
+        for child in children:
+            if child.wait(LONGEST):
+                raise subprocess.SubprocessError(f"status {child.returncode}")
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+        for counter in counters:
+            counter.join()
+
+
+def _start_child(names):
+    root = str(Path(__file__).parents[2])
+    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return subprocess.Popen(
+        [sys.executable, "-m", "sph_ros.sim.kernels", *names],
+        env={**os.environ, COMPILING: "1", "PYTHONPATH": os.pathsep.join(paths)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def _count(child):
+    """Count the functions that a child reports, one line each."""
+    global _compiled
+    with child.stdout:
+        for _ in child.stdout:
+            _compiled += 1
+
+
+class _Reporter(event.Listener):
+    """Prints a line for each function that is compiled."""
+
+    def on_start(self, event):
+        pass
+
+    def on_end(self, event):
+        print(event.data["dispatcher"].py_func.__name__, flush=True)
+
+
+def _save_in_turn():
+    """Let two processes not save to numba's cache at once.
+
+    Both may have another signature of the same function, and would take the same name for it.
+    """
+    save = caching.IndexDataCacheFile.save
+
+    def save_alone(self, key, data):
+        with open(Path(KERNELS, "saving"), "w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            save(self, key, data)
+
+    caching.IndexDataCacheFile.save = save_alone
+
+
+def _take_every_way(scene, dimension):
+    """Run a scene through all its kernels."""
     from sph_ros.sim.simulation import Simulation
 
-    solver, springs = sys.argv[1], "springs" in sys.argv[2:]
-    for dimension in (3, 2):
-        with tempfile.NamedTemporaryFile("w", suffix=".obj") as mesh:
-            scene = {**_SCENE, "dimension": dimension, "solver": solver}
-            if springs:
-                scene["material"] = "cream"
-            if dimension == 3:
-                print(_SHEET, file=mesh, flush=True)
-                surface = {"file": mesh.name, "restitution": 0.5}
-                scene["solids"] = [*_SCENE["solids"], {"name": "sheet", "surface": surface}]
-            simulation = Simulation(scene)
+    simulation = Simulation({**scene, "dimension": dimension})
+    if scene["solids"]:
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
-        simulation.step()
-        simulation.set_material(viscosity=0.001)
-        simulation.advance(0.02)
-        simulation.statistics()
-        simulation.surface()
-    _mark(solver, springs).touch()
+    simulation.step()
+    simulation.set_material(viscosity=0.001)
+    simulation.advance(0.02)
+    simulation.statistics()
+    simulation.surface()
+
+
+def main(names):
+    """Compile what each of the names needs, then leave its mark; `SOLVER-solids` has none."""
+    event.register("numba:compile", _Reporter())
+    _save_in_turn()
+    for name in names:
+        solver, _, feature = name.replace("-", "+-").partition("+")
+        solids = {"": _SOLIDS, "-solids": [], "bodies": [*_SOLIDS, _BODY]}
+        with tempfile.NamedTemporaryFile("w", suffix=".obj") as mesh:
+            if feature in ("sheets", "meshes"):
+                print(_SHEET if feature == "sheets" else _MESH, file=mesh, flush=True)
+                sheet = {"surface": {"file": mesh.name, "restitution": 0.5}}
+                shape = sheet if feature == "sheets" else {"mesh": {"file": mesh.name}}
+                solids[feature] = [*_SOLIDS, {"name": "mesh", **shape}]
+            for dimension in (3,) if feature == "sheets" else (3, 2):
+                scene = {**_SCENE, "solver": solver, "solids": solids.get(feature, _SOLIDS)}
+                if feature == "springs":
+                    scene["material"] = "cream"
+                _take_every_way(scene, dimension)
+        if not feature.startswith("-"):
+            _mark(name).touch()
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

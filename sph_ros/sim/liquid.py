@@ -102,6 +102,14 @@ def bounds(shape):
     return -np.array(half), np.array(half)
 
 
+def initial_length(scene):
+    """Largest extent of a block of liquid at the start [m]; 0 if there is none."""
+    sides = [upper - lower for lower, upper in (bounds(block.shape) for block in scene.liquid)]
+    if scene.dimension == 2:
+        sides = [side[[0, 2]] for side in sides]
+    return max((float(side.max()) for side in sides), default=0.0)
+
+
 def lattice_counts(shape, scene):
     """Lattice points along x, y, z that the bounding box of a liquid shape holds, as floats."""
     lower, upper = bounds(shape)

@@ -172,10 +172,10 @@ class PressureSolver(Solver):
             work.reactions,
         )
 
-    def _apply_viscosity(self, fluid, time_step):
-        """Viscosity and friction, which change velocities only."""
+    def _rates(self, time_step):
+        """How strongly the liquid rubs in a substep, `Rates`."""
         scales, friction = self.scales, self._material.wall_friction
-        rates = Rates(
+        return Rates(
             slope=DENSITY_POWER * scales.density_scale * self._packing / float(self._h),
             linear=scales.viscous_rate * time_step,
             quadratic=scales.quadratic * time_step,
@@ -184,9 +184,13 @@ class PressureSolver(Solver):
             wall_quadratic=friction * time_step / self._scene.spacing,
             inertia=scales.mass / time_step,
         )
+
+    def _apply_viscosity(self, fluid, time_step):
+        """Viscosity and friction, which change velocities only."""
+        rates = self._rates(time_step)
         if self._coupling is not None:
             # Free solids are dragged along by what they will rub on.
             self._coupling.drag_along(
-                fluid.velocities, rates.wall, rates.wall_quadratic, scales.mass
+                fluid.velocities, rates.wall, rates.wall_quadratic, self.scales.mass
             )
         apply_viscosity(self._work, fluid.velocities, rates, self._solids.motion)

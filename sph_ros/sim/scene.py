@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sph_ros.sim.jets import ENDLESS, capacity, make_jet
-from sph_ros.sim.kernels import compile_for
+from sph_ros.sim.kernels import ensure_compiled, needs
 from sph_ros.sim.liquid import (
     BYTES_PER_PARTICLE,
     available_memory,
@@ -363,7 +363,7 @@ def _check_openings(scene: Scene, root: Node) -> None:
 
 def _check_solids(scene: Scene, root: Node) -> None:
     """Refuse meshes that cannot be used, and liquid that starts inside a solid."""
-    compile_for(scene)
+    ensure_compiled(needs(scene))
     positions, _ = fill_liquid(scene)
     if scene.liquid and not len(positions):
         raise _item(root, "liquid", 0).error("holds no particle")

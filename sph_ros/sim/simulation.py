@@ -10,7 +10,7 @@ from sph_ros.core.surface import extract_surface
 from sph_ros.sim.emitters import Emitters
 from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
 from sph_ros.sim.jets import capacity
-from sph_ros.sim.kernels import compile_for, ensure_compiled
+from sph_ros.sim.kernels import ensure_compiled, needs
 from sph_ros.sim.liquid import families, fill_blocks
 from sph_ros.sim.materials import changed
 from sph_ros.sim.scales import scene_depth
@@ -55,7 +55,7 @@ class Simulation:
             SceneError: something in the scene is wrong.
         """
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        compile_for(self.scene)
+        ensure_compiled(needs(self.scene))
         self.material = self.scene.material
         self._solids = Solids(self.scene, SOLVER_CLASSES[self.scene.solver].WEIGHTS)
         self._start()
@@ -98,7 +98,7 @@ class Simulation:
             used = dataclasses.replace(used, elasticity=0.0)
             self.notes.append(f"elasticity: {fault}; there are no springs")
         elif material.elasticity > 0.0:
-            ensure_compiled(self.scene.solver, springs=True)
+            ensure_compiled([f"{self.scene.solver}+springs"])
         self._stable_step, _ = self._stable_step_of(used)
 
     def _stable_step_of(self, material):

@@ -39,6 +39,11 @@ class Rates(NamedTuple):
     wall_quadratic: float
     inertia: float
 
+    @property
+    def implicit(self):
+        """Whether the linear part is too strong for explicit impulses."""
+        return self.linear * self.neighbors > EXPLICIT_LIMIT
+
 
 def apply_viscosity(work, velocities, rates, motion):
     """Let pairs of neighbours share their velocities, and solids take theirs.
@@ -50,7 +55,7 @@ def apply_viscosity(work, velocities, rates, motion):
         rates: `Rates`.
         motion: of the solids.
     """
-    implicit = rates.linear * rates.neighbors > EXPLICIT_LIMIT
+    implicit = rates.implicit
     if rates.quadratic > 0.0 or (rates.linear > 0.0 and not implicit):
         relax.viscous_impulses(
             work.pairs,

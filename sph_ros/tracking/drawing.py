@@ -92,6 +92,8 @@ def _extent(target):
 
 
 def _text(picture, line, text, color):
-    place = (8, 20 + 18 * line)
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)
+    x, y = 8, 20 + 18 * line
+    # Thick letters behind would be wider ones in OpenCV 5, so four thin ones make the outline.
+    for place in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)

@@ -58,11 +58,10 @@ def validate(options):
 
 def _run(names, solvers, quick, data):
     """(outcomes, whether all checks were run)."""
-    from sph_ros.sim.kernels import ensure_compiled
+    from sph_ros.sim.kernels import ensure_compiled, everything
 
     with preparing():
-        for solver in solvers:
-            ensure_compiled(solver)
+        ensure_compiled([name for name in everything() if name.split("+")[0] in solvers])
     outcomes = []
     bar = tqdm(total=len(names) * len(solvers), disable=None, leave=False, bar_format=_BAR)
 

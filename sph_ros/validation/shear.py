@@ -24,11 +24,14 @@ END = 1.0
 
 #: Left free at both ends at the start [m]: a liquid that cannot yield has to have somewhere to go.
 ROOM = 0.003
+
+#: Newton's liquid: nothing that grows with the square of the speed.
 LIQUID = {
     "base": "honey",
     "density": 1000.0,
     "viscosity": 1.0,
     "surface_tension": 0.0,
+    "quadratic_viscosity": 0.0,
     "wall_friction": 1.0,
 }
 
