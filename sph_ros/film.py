@@ -21,7 +21,7 @@ class Film:
     """Draws states of a scene one after the other; a context manager.
 
     The camera stands so that the liquid, the emitters and all visible solids of the first state are
-    in view.
+    in view, and the solids that follow paths wherever these lead.
 
     Args:
         scene: the Scene.
@@ -111,13 +111,18 @@ class _Solids:
         ]
 
     def bounds(self, frame, emitters):
-        """(lower, upper) corner [m] of all but the planes, which are endless and do not count."""
+        """(lower, upper) corner [m] of all but planes, which are endless; with paths and jets."""
         points = [np.array(frame.bounds()) if len(frame.positions) else np.empty((0, 3))]
         for emitter in emitters:
             points.append(np.array(emitter.position) + [[-emitter.radius], [emitter.radius]])
         for view in frame.solids:
-            if not isinstance(self._specs[view.name].shape, Plane):
-                points.append(view.world_vertices())
+            spec = self._specs[view.name]
+            if not isinstance(spec.shape, Plane):
+                corners = view.world_vertices()
+                points.append(corners)
+                # Where its path takes it; how it is turned there hardly matters.
+                shifts = [np.array(key.position) - view.position for key in spec.path]
+                points += [np.stack([corners.min(axis=0), corners.max(axis=0)]) + s for s in shifts]
         points = np.concatenate(points)
         return points.min(axis=0), points.max(axis=0)
 

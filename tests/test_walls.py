@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
+import sph_ros
 from sph_ros.core.distances import signed_distances
 from sph_ros.core.wall_tables import flat_wall, layer_weight, round_ratio
 from sph_ros.core.walls import wall_terms_at
@@ -285,3 +286,25 @@ def test_other_support_radii():
         weights = np.where(r < support, (1 - np.minimum(r / support, 1)) ** 2, 0) / full
         wall = terms_at(Plane(), [0, 0, S / 2], support=support)[0, F]
         assert weights[grid[:, 2] > -1e-9].sum() + wall == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("solver", ["relaxation", "incompressible"])
+def test_a_weightless_drop_stays_on_a_wall_that_holds_it_and_leaves_one_that_does_not(solver):
+    """Adhesion 1 is a contact angle of 0 degrees, 0 one of 180: a ball that touches in a point."""
+
+    def touching(adhesion):
+        sim = sph_ros.Simulation(
+            {
+                "solver": solver,
+                "spacing": 0.0025,
+                "support_radius": 0.007,
+                "gravity": [0, 0, 0],
+                "material": {"base": "water", "viscosity": 0.01, "adhesion": adhesion},
+                "liquid": [{"box": {"min": [-0.01, -0.01, 0], "max": [0.01, 0.01, 0.01]}}],
+                "solids": [{"name": "wall", "plane": {}}],
+            }
+        )
+        sim.advance(0.5)
+        return (sim.positions[:, 2] < 0.0025).mean()
+
+    assert touching(1.0) > 0.2 and touching(0.0) < 0.02
