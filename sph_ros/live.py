@@ -91,9 +91,14 @@ def start_node(children, name, *parameters, remaps=()):
 
 def wait_until_ready(children, watch, name, topic):
     """Wait until a node that may compile first publishes a topic."""
+    wait_until(children, watch, name, lambda: watch.is_published(topic))
+
+
+def wait_until(children, watch, name, condition):
+    """Wait until something holds of a node that may compile first, and show how long it takes."""
     begin = time.monotonic()
     with tqdm(bar_format="{desc}", disable=None, leave=False) as line:
-        while not watch.is_published(topic):
+        while not condition():
             watch.spin(0.1)
             children.check()
             seconds = time.monotonic() - begin

@@ -23,6 +23,7 @@ from sph_ros.live import (
     run_program,
     start_fluid,
     start_node,
+    wait_until,
     wait_until_ready,
     watch_until_stopped,
 )
@@ -45,6 +46,7 @@ LATENCY = 0.02
 
 FPS = 30.0
 RESULTS = ("webcam.mp4", "last.png")
+TRACKER_INPUT, PREPARING = "marker_tracker: input", "preparing"  # of its diagnostics
 PICTURES = "/ar_overlay/image/compressed"
 
 
@@ -297,6 +299,7 @@ def _record_pictures(options, scene, calibration, seconds, pictures):
         _start_overlay(children, watch, options, scene, "jpeg_quality:=95")
         watch.hear(CompressedImage, PICTURES, pictures.add)
         _start_tracker(children, options, scene, calibration, loop=False)
+        wait_until(children, watch, "marker_tracker", lambda: _is_prepared(watch))
         begin = time.monotonic()
         bar = "recording {n:.1f} s {postfix}"
         with tqdm(bar_format=bar, disable=None, leave=False) as line:
@@ -307,11 +310,16 @@ def _record_pictures(options, scene, calibration, seconds, pictures):
         return pictures.seconds
 
 
+def _is_prepared(watch):
+    """Whether the tracker has compiled, and opens the camera."""
+    return watch.states.get(TRACKER_INPUT, PREPARING) != PREPARING
+
+
 def _is_over(pictures, begin, seconds, options, watch):
     now = time.monotonic()
     if not len(pictures):
         if now - begin > FIRST_PICTURE:
-            reason = watch.alerts.get("marker_tracker: input", "is the camera there, and free?")
+            reason = watch.alerts.get(TRACKER_INPUT, "is the camera there, and free?")
             raise LiveError(f"no picture within {FIRST_PICTURE:g} s: {reason}")
         return False
     if seconds is not None and options.rate * pictures.seconds >= seconds:

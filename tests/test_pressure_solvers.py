@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 import sph_ros
 from sph_ros.core import projection as project
+from sph_ros.core import relaxation as relax
 
 SOLVERS = ("relaxation", "incompressible")
 
@@ -92,11 +93,15 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
     generator = np.random.default_rng(3)
     shift = generator.normal(0.0, 0.1 * scene.spacing, work.displacements.shape)
     work.displacements[:] = shift
+    h = np.float32(scene.support_radius)
+    none = np.zeros_like(work.scaled), work.contacts.gradients, work.displacements.copy()
+    relax.pressure_displacements(work.pairs, *none, h, work.displacements, work.packed)
     scale = sim._solver.scales.density_scale * sim._solver._packing
     project.density_targets(
-        work.predicted,
+        work.columns,
         work.displacements,
-        np.float32(scene.support_radius),
+        work.packed,
+        h,
         np.float32(scale),
         work.pairs,
         work.sums.density,

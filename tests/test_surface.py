@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sph_ros.core import surface as surface_module
-from sph_ros.core.surface import colour_field, extract_surface
+from sph_ros.core.marching import marching_cubes
+from sph_ros.core.surface import Surface, colour_field, extract_surface
 
 SPACING = 0.01
 
@@ -50,6 +51,32 @@ def component_count(mesh):
     i, j = directed_edges(mesh.triangles).T
     shape = (len(mesh.vertices),) * 2
     return connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape))[0]
+
+
+def test_marching_cubes_closes_every_case_and_interpolates():
+    """All 256 cases, each beside what random neighbours make of it; vertices against the field."""
+    rng = np.random.default_rng(2)
+    for case in range(256):
+        field = np.zeros((6, 6, 6), np.float32)
+        field[1:-1, 1:-1, 1:-1] = rng.random((4, 4, 4))
+        inside = np.array([case >> corner & 1 for corner in range(8)]).reshape(2, 2, 2).T
+        field[2:4, 2:4, 2:4] = 0.2 + 0.6 * inside
+        nodes, triangles = marching_cubes(field, 0.5)
+        assert_closed_and_oriented(Surface(nodes, triangles, nodes))
+        low = np.floor(nodes).astype(int)
+        high, share = np.ceil(nodes).astype(int), (nodes - low).max(axis=1)
+        assert (np.abs(high - low).sum(axis=1) == 1).all()  # on an edge of the grid
+        a, b = field[tuple(low.T)], field[tuple(high.T)]
+        assert np.allclose(a + share * (b - a), 0.5, atol=1e-5)
+    thread = np.zeros((5, 5, 5), np.float32)  # two corners across a cell, and its middle
+    for middle, parts in ((0.4, 1), (0.1, 2)):
+        thread[1:4, 1:4, 1:4] = middle
+        thread[[1, 2], [1, 2], [1, 2]] = 1.0
+        mesh = Surface(*marching_cubes(thread, 0.5), None)
+        assert_closed_and_oriented(mesh)
+        assert component_count(mesh) == parts and enclosed_volume(mesh) > 0.0
+    with pytest.raises(ValueError, match="border"):
+        marching_cubes(np.ones((3, 3, 3), np.float32), 0.5)
 
 
 def test_ball_of_particles_gives_a_sphere():

@@ -320,6 +320,7 @@ def test_dragging_the_gizmo_moves_the_ball_in_the_simulation(stage, page):
     ros.wait_for(lambda: drag_ball(page) and poses, 60.0, "for a dragged pose")
     last = lambda: poses[-1].pose.position  # noqa: E731
     hand = lambda: np.array([last().x, last().y, last().z])  # noqa: E731
+    ros.wait_for(lambda: hand()[2] > start[2] + 0.005, what="for the pull")
     ros.wait_for(lambda: np.allclose(stage.ball(), hand(), atol=1e-5), what="for the ball")
     moved = stage.ball() - start
     assert moved[2] > 0.005 and np.abs(moved[:2]).max() < 1e-6  # along the arrow that was pulled

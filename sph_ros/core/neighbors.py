@@ -13,13 +13,11 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.jit import device, kernel, parallel_kernel
+from sph_ros.core.pair_sums import LIST_STEP, geometry_of_pairs
 from sph_ros.core.vector import LANES, append_within
 
 #: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
 CHUNK = 256
-
-#: Lists have a multiple of so many entries.
-LIST_STEP = 8
 
 
 class Grid(NamedTuple):
@@ -249,60 +247,21 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
         pairs: `gradients` is written.
         sums: all written.
     """
-    one = np.float32(1.0)
-    inverse_h = one / support_radius
+    inverse_h = np.float32(1.0) / support_radius
     slope = np.float32(-2.0) * density_scale * inverse_h
-    xs, ys, zs = columns[0], columns[1], columns[2]
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
     for i in prange(pairs.start.shape[0]):
-        x, y, z = xs[i], ys[i], zs[i]
-        w, n = np.float32(0.0), np.float32(0.0)
-        tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        square = np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        # One loop for each array written: with more the compiler gives up proving that they do not
-        # overlap with those read, and makes no vector code.
-        for k in range(js.shape[0]):
-            j = js[k]
-            dx = x - xs[j]
-            dy = y - ys[j]
-            dz = z - zs[j]
-            # The tiny addend lets a particle be its own neighbour: 0 / tiny is 0.
-            us[k] = dx * dx + dy * dy + dz * dz + np.float32(1e-20)
-        for k in range(js.shape[0]):
-            r2 = us[k]
-            inverse_r = one / np.sqrt(r2)
-            u = one - r2 * inverse_r * inverse_h
-            us[k] = u
-            gx[k] = slope * u * inverse_r
-            w += u * u
-            n += u * u * u
-            square += slope * slope * u * u
-        for k in range(js.shape[0]):
-            c = gx[k] * (y - ys[js[k]])
-            gy[k] = c
-            ty += c
-        for k in range(js.shape[0]):
-            c = gx[k] * (z - zs[js[k]])
-            gz[k] = c
-            tz += c
-        for k in range(js.shape[0]):
-            c = gx[k] * (x - xs[js[k]])
-            gx[k] = c
-            tx += c
+        w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h)
         # Each entry that only fills the list has counted as the particle itself, with weight 1.
-        filling = np.float32(end - start - pairs.count[i])
+        filling = np.float32(pairs.end[i] - pairs.start[i] - pairs.count[i])
         density[i] = density_scale * (w - filling) + wall_density[i, 0]
         near_density[i] = near_scale * (n - filling) + wall_density[i, 1]
-        gradient[i, 0] = tx
-        gradient[i, 1] = ty
-        gradient[i, 2] = tz
+        gradient[i, 0] = x
+        gradient[i, 1] = y
+        gradient[i, 2] = z
         # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
-        gradient_square[i] = square - slope * slope * (filling + one)
+        gradient_square[i] = square - slope * slope * (filling + np.float32(1.0))
 
 
 @parallel_kernel

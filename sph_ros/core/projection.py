@@ -25,6 +25,7 @@ from sph_ros.core.contacts import (
 )
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.pair_sums import growth_by_pairs
 
 #: Excess of density that may be taken back over several steps [-].
 MILD = np.float32(0.01)
@@ -76,8 +77,9 @@ def push(velocities, gravity, time_step, displacements):
 
 @parallel_kernel
 def density_targets(
-    positions,
+    columns,
     displacements,
+    packed,
     support_radius,
     density_scale,
     pairs,
@@ -94,8 +96,8 @@ def density_targets(
     at the given displacements and linear in w.
 
     Args:
-        positions: [m], (N, 3).
-        displacements: expected ones [m], (N, 3).
+        columns: positions [m], as in `find_neighbors`.
+        displacements, packed: expected ones, from `pressure_displacements`.
         support_radius: h [m], float32.
         density_scale: 1 / lattice sum of the weight [-], float32.
         pairs: from `sum_densities` at `positions`.
@@ -108,27 +110,8 @@ def density_targets(
         targets: [-], (N,); written.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
-    inverse_h = one / support_radius
     for i in prange(targets.shape[0]):
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        ux, uy, uz = displacements[i, 0], displacements[i, 1], displacements[i, 2]
-        grown, linear = zero, zero
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            mx = ux - displacements[j, 0]
-            my = uy - displacements[j, 1]
-            mz = uz - displacements[j, 2]
-            linear += gx[k] * mx + gy[k] * my + gz[k] * mz
-            dx = x - positions[j, 0] + mx
-            dy = y - positions[j, 1] + my
-            dz = z - positions[j, 2] + mz
-            u = one - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
-            u = u if u > zero else zero
-            grown += u * u - us[k] * us[k]
+        grown, linear = growth_by_pairs(pairs, columns, displacements, packed, i, support_radius)
         excess = density[i] - one
         if excess > zero:
             excess = share * min(excess, MILD) + rest * max(excess - MILD, zero)

@@ -21,6 +21,7 @@ from numba import prange
 
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.pair_sums import divergence_of_pairs, pack, push_by_pairs
 
 
 class Tension(NamedTuple):
@@ -119,7 +120,9 @@ def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
 
 
 @parallel_kernel
-def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displacements):
+def pressure_displacements(
+    pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
+):
     """Displacements by the present pressures (Clavet 2005, Alg. 2, gathered).
 
     Args:
@@ -127,23 +130,18 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
         pressures: times dt^2 / (rho0 virial) [m^2], (N,).
         contact_gradients: as in `cohesive_displacements`.
         cohesive: displacements to start from [m], (N, 3).
+        support_radius: h [m], float32.
         displacements: [m], (N, 3); written.
+        packed: the same by `pack`, (N,) int64; written.
     """
     for i in prange(pressures.shape[0]):
         own = pressures[i]
-        x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz = pairs.gradients[2, start:end]
-        for k in range(js.shape[0]):
-            both = own + pressures[js[k]]
-            x += both * gx[k]
-            y += both * gy[k]
-            z += both * gz[k]
-        displacements[i, 0] = cohesive[i, 0] - x - own * contact_gradients[i, 0]
-        displacements[i, 1] = cohesive[i, 1] - y - own * contact_gradients[i, 1]
-        displacements[i, 2] = cohesive[i, 2] - z - own * contact_gradients[i, 2]
+        x, y, z = push_by_pairs(pairs, pressures, i)
+        x = cohesive[i, 0] - x - own * contact_gradients[i, 0]
+        y = cohesive[i, 1] - y - own * contact_gradients[i, 1]
+        z = cohesive[i, 2] - z - own * contact_gradients[i, 2]
+        displacements[i, 0], displacements[i, 1], displacements[i, 2] = x, y, z
+        packed[i] = pack(x, y, z, support_radius)
 
 
 @parallel_kernel
@@ -151,7 +149,9 @@ def correct_pressures(
     pairs,
     densities,
     contact_gradients,
+    support_radius,
     displacements,
+    packed,
     yielded,
     diagonal,
     compliance,
@@ -170,7 +170,8 @@ def correct_pressures(
         pairs: from `sum_densities`.
         densities: at the displacements zero, relative to rest [-], (N,).
         contact_gradients: as in `cohesive_displacements`.
-        displacements: by the present guesses [m], (N, 3).
+        support_radius: h [m], float32.
+        displacements, packed: by the present guesses, from `pressure_displacements`.
         yielded: how much the density sinks because free bodies give way to the guesses [-], (N,).
         diagonal: from `pressure_diagonal`.
         compliance: as in `pressure_diagonal`.
@@ -191,17 +192,7 @@ def correct_pressures(
                 + contact_gradients[i, 2] * z
                 - yielded[i]
             )
-            start, end = pairs.start[i], pairs.end[i]
-            js = pairs.neighbors[start:end]
-            gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-            gz = pairs.gradients[2, start:end]
-            for k in range(js.shape[0]):
-                j = js[k]
-                change += (
-                    gx[k] * (x - displacements[j, 0])
-                    + gy[k] * (y - displacements[j, 1])
-                    + gz[k] * (z - displacements[j, 2])
-                )
+            change += divergence_of_pairs(pairs, displacements, packed, i, support_radius)
             pressure = guesses[i]
             residual = densities[i] - np.float32(1.0) + change - compliance * pressure
             better = max(pressure + share * residual / diagonal[i], np.float32(0.0))

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
 
 from sph_ros.core.jit import device, kernel
+from sph_ros.core.marching import marching_cubes
 
 #: Level of the colour field that is called the surface: half way between air and liquid.
 SURFACE_COLOUR = 0.5
@@ -161,23 +161,20 @@ def margin_nodes(spacing, support_radius, cell_size) -> int:
 
 
 def march(field, grid) -> Surface:
-    """Marching cubes (Lewiner et al. 2003, scikit-image) on a field, normals by its gradient.
+    """Marching cubes on a field, normals by its gradient.
 
     Vertices are in the world frame [m]. The field's border must be 0, so that the mesh is closed.
     Normals are those of the field blurred once more: they show unrest long before positions do.
     """
     if field.max(initial=0.0) <= SURFACE_COLOUR:
         return _empty()
-    nodes, triangles, _, _ = marching_cubes(
-        field, SURFACE_COLOUR, gradient_direction="ascent", allow_degenerate=True
-    )
-    nodes = np.ascontiguousarray(nodes, np.float32)
+    nodes, triangles = marching_cubes(field, SURFACE_COLOUR)
     normals = np.empty_like(nodes)
     smooth = np.empty_like(field)
     _blur_pass(field, field.shape[1] == 4, np.empty_like(field), smooth)
     _field_normals(smooth, nodes, 1.0 / grid.cell, normals)
     vertices = ((nodes + grid.first) * grid.cell).astype(np.float32)
-    return Surface(vertices, np.ascontiguousarray(triangles, np.int32), normals)
+    return Surface(vertices, triangles, normals)
 
 
 def _checked(positions, spacing, support_radius, cell_size, dimension):

@@ -100,6 +100,7 @@ class Recorder:
         facts: newest diagnostics of the simulation, key -> text.
         counts: messages heard, topic -> number.
         alerts: what other nodes complain of at present, name -> text.
+        states: what all parts of nodes said last in their diagnostics, name -> text.
     """
 
     def __enter__(self):
@@ -108,7 +109,7 @@ class Recorder:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._topics = TopicRecorder(self._node)
-        self.facts, self.alerts = {}, {}
+        self.facts, self.alerts, self.states = {}, {}, {}
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._keep_facts, DEPTH, raw=True
         )
@@ -152,6 +153,7 @@ class Recorder:
     def _keep_facts(self, data):
         self._topics.keep("/diagnostics", DIAGNOSTIC_ARRAY, data)
         for status in deserialize_message(data, DiagnosticArray).status:
+            self.states[status.name] = status.message
             if status.name == "fluid: simulation":
                 self.facts = {item.key: item.value for item in status.values}
             elif status.level != DiagnosticStatus.OK:

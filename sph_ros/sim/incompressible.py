@@ -181,7 +181,13 @@ class IncompressibleSolver(PressureSolver):
         work.cohesive[:] = self._gravity * np.float32(time_step**2)
         # `starts` has no other use between the lists and the next positions.
         relax.pressure_displacements(
-            work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.starts
+            work.pairs,
+            work.scaled,
+            work.contacts.gradients,
+            work.cohesive,
+            self._h,
+            work.starts,
+            work.packed,
         )
         work.starts *= np.float32(1.0 / time_step)
         fluid.velocities += work.starts
@@ -203,11 +209,18 @@ class IncompressibleSolver(PressureSolver):
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
         pace = min(time_step / self._longest, 1.0)
         relax.pressure_displacements(
-            work.pairs, work.scaled, work.contacts.gradients, work.cohesive, work.displacements
+            work.pairs,
+            work.scaled,
+            work.contacts.gradients,
+            work.cohesive,
+            self._h,
+            work.displacements,
+            work.packed,
         )
         project.density_targets(
-            work.predicted,
+            work.columns,
             work.displacements,
+            work.packed,
             self._h,
             np.float32(self.scales.density_scale * self._packing),
             work.pairs,

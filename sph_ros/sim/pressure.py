@@ -33,7 +33,15 @@ class Goal(NamedTuple):
 
 
 def solve_pressures(
-    work, densities, gradients, compliance, goal, share, coupling=None, displaced=False
+    work,
+    densities,
+    gradients,
+    support_radius,
+    compliance,
+    goal,
+    share,
+    coupling=None,
+    displaced=False,
 ):
     """Scaled pressures that hold the density, and the displacements they cause.
 
@@ -42,6 +50,7 @@ def solve_pressures(
             and, in `scaled`, a first guess; `scaled` and `displacements` are written.
         densities: without displacement, relative to rest [-], (N,).
         gradients: of the contacts, (N, 6).
+        support_radius: h [m], float32.
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.
         share: of the Jacobi correction to take.
@@ -51,6 +60,18 @@ def solve_pressures(
     Returns:
         Iterations taken, mean density error left, share to start from next time.
     """
+
+    def displace(pressures):
+        relax.pressure_displacements(
+            work.pairs,
+            pressures,
+            gradients,
+            work.cohesive,
+            support_radius,
+            work.displacements,
+            work.packed,
+        )
+
     first = work.scaled.copy()
     best = np.inf
     inertia, restart = FIRST_INERTIA, True
@@ -59,9 +80,7 @@ def solve_pressures(
             work.guesses[:] = work.scaled
             before, restart = np.inf, False
         if iteration > 1 or not displaced:
-            relax.pressure_displacements(
-                work.pairs, work.guesses, gradients, work.cohesive, work.displacements
-            )
+            displace(work.guesses)
         if coupling is not None:
             coupling.respond(work.guesses)
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia**2))
@@ -69,7 +88,9 @@ def solve_pressures(
             work.pairs,
             densities,
             gradients,
+            support_radius,
             work.displacements,
+            work.packed,
             work.yielded,
             work.diagonal,
             compliance,
@@ -91,7 +112,5 @@ def solve_pressures(
         # Extrapolation that made it worse starts over (O'Donoghue & Candes 2015).
         inertia, before = (1.0 if error > before else grown), error
         best = min(best, error)
-    relax.pressure_displacements(
-        work.pairs, work.scaled, gradients, work.cohesive, work.displacements
-    )
+    displace(work.scaled)
     return iteration, error, min(GROW * share, FIRST_SHARE)

@@ -152,7 +152,15 @@ class PressureSolver(Solver):
         if self._coupling is not None:
             self._coupling.add_diagonal(work.diagonal)
         self.iterations, self.density_error, self._share = solve_pressures(
-            work, densities, gradients, compliance, goal, self._share, self._coupling, displaced
+            work,
+            densities,
+            gradients,
+            self._h,
+            compliance,
+            goal,
+            self._share,
+            self._coupling,
+            displaced,
         )
         self._book_push(work.scaled, NO_TENSION, time_step)
 

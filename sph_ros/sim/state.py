@@ -153,6 +153,7 @@ class Workspace:
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses, targets, yielded: of the pressure iterations, (N,) float32.
+        packed: displacements once more, (N,) int64.
         masses: of the particles where they differ [kg]; scales: times a factor, (N,) float32.
         errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
         totals: (chunks, 3) float64.
@@ -174,11 +175,12 @@ class Workspace:
         "guesses": (0, np.float32),
         "targets": (0, np.float32),
         "yielded": (0, np.float32),
+        "packed": (0, np.int64),
         "masses": (0, np.float32),
         "scales": (0, np.float32),
     }
 
-    def __init__(self, capacity, solids, slots=None, pairs_per_particle=44):
+    def __init__(self, capacity, solids, slots=None, pairs_per_particle=56):
         """Allocate for `capacity` particles, all of which are there.
 
         Args:

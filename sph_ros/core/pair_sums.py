@@ -1,0 +1,467 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sums over the pairs of one particle: what nearly all time of a step goes into.
+
+Each comes twice with the same meaning: as a plain loop, which the compiler turns into what vector
+code it can, and by hand for processors with AVX-512. Their time goes into reading what belongs to
+the neighbours, one element at a time: three floats of a displacement take longer than all
+arithmetic. So by hand a displacement is read as one word of fixed-point numbers (`pack`), a third
+of the elements.
+"""
+
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+
+from sph_ros.core.jit import inlined
+from sph_ros.core.vector import (
+    FAST,
+    FLOATS,
+    HAS_GATHER,
+    INTS,
+    LANES,
+    constant,
+    data_pointer,
+    gather,
+    gather_words,
+    lane_sum,
+    load,
+    multiply_add,
+    positive,
+    splat,
+    square_root,
+    store,
+    vector_loop,
+)
+
+#: Lists of neighbours have a multiple of so many entries.
+LIST_STEP = LANES if HAS_GATHER else 8
+
+#: Numbers in a packed displacement are whole multiples of `REACH` support radii / 2^20.
+REACH = np.float32(4.0)
+LARGEST = np.float32((1 << 20) - 1)
+
+#: Added to the squared distance of each pair [m^2], so that a particle may be its own neighbour:
+#: 0 / tiny is 0.
+TINY = 1e-20
+
+
+@inlined
+def resolution(support_radius):
+    """Length of the unit of packed displacements [m]."""
+    return support_radius * REACH / np.float32(1 << 20)
+
+
+@inlined
+def _whole(value, inverse):
+    """`value` in units of 1 / `inverse`, a whole number; what does not fit becomes the largest."""
+    return np.int64(np.rint(max(min(value * inverse, LARGEST), -LARGEST)))
+
+
+@inlined
+def pack(x, y, z, support_radius):
+    """A displacement [m] in one word: x and y in 21 bits each, z in 22.
+
+    The lower half of the word holds x and half of z, the upper one y and the rest of z.
+    """
+    inverse = np.float32(1.0) / resolution(support_radius)
+    z_bits = _whole(z, inverse) + (1 << 20)
+    low = ((_whole(x, inverse) << 11) & 0xFFFFFFFF) | (z_bits & 0x7FF)
+    return (_whole(y, inverse) << 43) | ((z_bits >> 11) << 32) | low
+
+
+@inlined
+def unpacked(word):
+    """Components of a packed displacement, whole numbers in its unit, float32."""
+    z = ((((word >> 32) & 0x7FF) << 11) | (word & 0x7FF)) - (1 << 20)
+    return np.float32((word << 32) >> 43), np.float32(word >> 43), np.float32(z)
+
+
+def _unpacked(builder, source, indices):
+    """Components of the packed displacements source[indices], vectors of floats, in their unit."""
+    low, high = gather_words(builder, source, indices)
+    eleven, mask = constant(11, INTS), constant(0x7FF, INTS)
+    z_low = builder.and_(low, mask)
+    z_high = builder.shl(builder.and_(high, mask), eleven)
+    z = builder.sub(builder.or_(z_low, z_high), constant(1 << 20, INTS))
+    whole = builder.ashr(low, eleven), builder.ashr(high, eleven), z
+    return [builder.sitofp(number, FLOATS) for number in whole]
+
+
+# ---------------------------------------------------------------- pushes
+
+
+@intrinsic
+def _push_in_vectors(typingctx, neighbors, gradients, values, start, end, own):
+    signature = types.UniTuple(types.float32, 3)(
+        neighbors, gradients, values, types.intp, types.intp, types.float32
+    )
+
+    def codegen(context, builder, sig, args):
+        neighbors_, gradients_, values_, start_, end_, own_ = args
+        js = data_pointer(context, builder, sig.args[0], neighbors_)
+        rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(3)]
+        source = data_pointer(context, builder, sig.args[2], values_)
+        centre = splat(builder, own_)
+
+        def body(k, sums):
+            theirs = gather(builder, source, load(builder, js, k, INTS))
+            both = builder.fadd(centre, theirs, flags=FAST)
+            return [
+                multiply_add(builder, both, load(builder, row, k), value)
+                for row, value in zip(rows, sums, strict=True)
+            ]
+
+        sums = vector_loop(builder, start_, end_, 3, body)
+        total = [lane_sum(builder, value) for value in sums]
+        return context.make_tuple(builder, sig.return_type, total)
+
+    return signature, codegen
+
+
+@inlined
+def _push_plainly(neighbors, gradients, values, start, end, own):
+    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    js = neighbors[start:end]
+    gx, gy, gz = gradients[0, start:end], gradients[1, start:end], gradients[2, start:end]
+    for k in range(js.shape[0]):
+        both = own + values[js[k]]
+        x += both * gx[k]
+        y += both * gy[k]
+        z += both * gz[k]
+    return x, y, z
+
+
+_push = _push_in_vectors if HAS_GATHER else _push_plainly
+
+
+@inlined
+def push_by_pairs(pairs, values, i):
+    """Sum of (a_i + a_j) g_ij over the neighbours j of particle i, x, y, z.
+
+    Args:
+        pairs: from `sum_densities`.
+        values: a, (N,) float32.
+        i: row of the particle.
+    """
+    return _push(pairs.neighbors, pairs.gradients, values, pairs.start[i], pairs.end[i], values[i])
+
+
+# ---------------------------------------------------------------- divergences
+
+
+@intrinsic
+def _divergence_in_vectors(typingctx, neighbors, gradients, packed, start, end, x, y, z):
+    real = types.float32
+    signature = real(neighbors, gradients, packed, types.intp, types.intp, real, real, real)
+
+    def codegen(context, builder, sig, args):
+        neighbors_, gradients_, packed_, start_, end_, x_, y_, z_ = args
+        js = data_pointer(context, builder, sig.args[0], neighbors_)
+        rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(3)]
+        source = data_pointer(context, builder, sig.args[2], packed_)
+        centre = [splat(builder, value) for value in (x_, y_, z_)]
+
+        def body(k, sums):
+            theirs = _unpacked(builder, source, load(builder, js, k, INTS))
+            total = sums[0]
+            for row, own, other in zip(rows, centre, theirs, strict=True):
+                way = builder.fsub(own, other, flags=FAST)
+                total = multiply_add(builder, load(builder, row, k), way, total)
+            return [total]
+
+        return lane_sum(builder, vector_loop(builder, start_, end_, 1, body)[0])
+
+    return signature, codegen
+
+
+@inlined
+def _divergence_by_hand(pairs, displacements, packed, i, support_radius):
+    x, y, z = unpacked(packed[i])
+    return resolution(support_radius) * _divergence_in_vectors(
+        pairs.neighbors, pairs.gradients, packed, pairs.start[i], pairs.end[i], x, y, z
+    )
+
+
+@inlined
+def _divergence_plainly(pairs, displacements, packed, i, support_radius):
+    x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+    change = np.float32(0.0)
+    start, end = pairs.start[i], pairs.end[i]
+    js = pairs.neighbors[start:end]
+    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+    gz = pairs.gradients[2, start:end]
+    for k in range(js.shape[0]):
+        j = js[k]
+        change += (
+            gx[k] * (x - displacements[j, 0])
+            + gy[k] * (y - displacements[j, 1])
+            + gz[k] * (z - displacements[j, 2])
+        )
+    return change
+
+
+_divergence = _divergence_by_hand if HAS_GATHER else _divergence_plainly
+
+
+@inlined
+def divergence_of_pairs(pairs, displacements, packed, i, support_radius):
+    """Sum of g_ij . (w_i - w_j) over the neighbours j of particle i: how much denser it gets [-].
+
+    Args:
+        pairs: from `sum_densities`.
+        displacements: w [m], (N, 3).
+        packed: the same by `pack`, (N,) int64.
+        i: row of the particle.
+        support_radius: h [m], float32.
+    """
+    return _divergence(pairs, displacements, packed, i, support_radius)
+
+
+# ---------------------------------------------------------------- densities after displacements
+
+
+@intrinsic
+def _growth_in_vectors(
+    typingctx, neighbors, gradients, columns, packed, start, end, at, way, unit, inverse_h
+):
+    signature = types.UniTuple(types.float32, 2)(
+        neighbors,
+        gradients,
+        columns,
+        packed,
+        types.intp,
+        types.intp,
+        at,
+        way,
+        types.float32,
+        types.float32,
+    )
+
+    def codegen(context, builder, sig, args):
+        neighbors_, gradients_, columns_, packed_, start_, end_, at_, way_, unit_, inverse_ = args
+        js = data_pointer(context, builder, sig.args[0], neighbors_)
+        rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
+        places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
+        source = data_pointer(context, builder, sig.args[3], packed_)
+        centre = [splat(builder, builder.extract_value(at_, axis)) for axis in range(3)]
+        own_way = [splat(builder, builder.extract_value(way_, axis)) for axis in range(3)]
+        unit_, inverse_ = splat(builder, unit_), splat(builder, inverse_)
+
+        def body(k, sums):
+            grown, linear = sums
+            indices = load(builder, js, k, INTS)
+            square = None
+            theirs = _unpacked(builder, source, indices)
+            for axis, other in enumerate(theirs):
+                relative = builder.fsub(own_way[axis], other, flags=FAST)
+                relative = builder.fmul(relative, unit_, flags=FAST)
+                linear = multiply_add(builder, load(builder, rows[axis], k), relative, linear)
+                there = gather(builder, places[axis], indices)
+                apart = builder.fadd(
+                    builder.fsub(centre[axis], there, flags=FAST), relative, flags=FAST
+                )
+                term = builder.fmul(apart, apart, flags=FAST)
+                square = term if square is None else builder.fadd(square, term, flags=FAST)
+            share = builder.fmul(square_root(builder, square), inverse_, flags=FAST)
+            u = positive(builder, builder.fsub(constant(1.0), share, flags=FAST))
+            before = load(builder, rows[3], k)
+            grown = multiply_add(builder, u, u, grown)
+            grown = builder.fsub(grown, builder.fmul(before, before, flags=FAST), flags=FAST)
+            return [grown, linear]
+
+        sums = vector_loop(builder, start_, end_, 2, body)
+        total = [lane_sum(builder, value) for value in sums]
+        return context.make_tuple(builder, sig.return_type, total)
+
+    return signature, codegen
+
+
+@inlined
+def _growth_by_hand(pairs, columns, displacements, packed, i, support_radius):
+    # Its own displacement packed, too: only then a particle does not move against itself.
+    return _growth_in_vectors(
+        pairs.neighbors,
+        pairs.gradients,
+        columns,
+        packed,
+        pairs.start[i],
+        pairs.end[i],
+        (columns[0, i], columns[1, i], columns[2, i]),
+        unpacked(packed[i]),
+        resolution(support_radius),
+        np.float32(1.0) / support_radius,
+    )
+
+
+@inlined
+def _growth_plainly(pairs, columns, displacements, packed, i, support_radius):
+    one, zero = np.float32(1.0), np.float32(0.0)
+    inverse_h = one / support_radius
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    x, y, z = xs[i], ys[i], zs[i]
+    ux, uy, uz = displacements[i, 0], displacements[i, 1], displacements[i, 2]
+    grown, linear = zero, zero
+    start, end = pairs.start[i], pairs.end[i]
+    js = pairs.neighbors[start:end]
+    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+    gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+    for k in range(js.shape[0]):
+        j = js[k]
+        mx = ux - displacements[j, 0]
+        my = uy - displacements[j, 1]
+        mz = uz - displacements[j, 2]
+        linear += gx[k] * mx + gy[k] * my + gz[k] * mz
+        dx, dy, dz = x - xs[j] + mx, y - ys[j] + my, z - zs[j] + mz
+        u = one - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
+        u = u if u > zero else zero
+        grown += u * u - us[k] * us[k]
+    return grown, linear
+
+
+_growth = _growth_by_hand if HAS_GATHER else _growth_plainly
+
+
+@inlined
+def growth_by_pairs(pairs, columns, displacements, packed, i, support_radius):
+    """What particle i's sum over neighbours of (1 - r/h)^2 grows by, and linearised.
+
+    The second is in units of density, see `divergence_of_pairs`.
+
+    Args:
+        pairs, displacements, packed, i, support_radius: as in `divergence_of_pairs`.
+        columns: coordinates before [m], as in `find_neighbors`.
+    """
+    return _growth(pairs, columns, displacements, packed, i, support_radius)
+
+
+# ---------------------------------------------------------------- geometry
+
+
+@intrinsic
+def _geometry_in_vectors(
+    typingctx, neighbors, gradients, columns, start, end, at, slope, inverse_h
+):
+    signature = types.UniTuple(types.float32, 6)(
+        neighbors,
+        gradients,
+        columns,
+        types.intp,
+        types.intp,
+        at,
+        types.float32,
+        types.float32,
+    )
+
+    def codegen(context, builder, sig, args):
+        neighbors_, gradients_, columns_, start_, end_, at_, slope_, inverse_ = args
+        js = data_pointer(context, builder, sig.args[0], neighbors_)
+        rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
+        places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
+        centre = [splat(builder, builder.extract_value(at_, axis)) for axis in range(3)]
+        slope_, inverse_ = splat(builder, slope_), splat(builder, inverse_)
+        one, tiny = constant(1.0), constant(TINY)
+
+        def body(k, sums):
+            indices = load(builder, js, k, INTS)
+            square, apart = tiny, []
+            for place, own in zip(places, centre, strict=True):
+                apart.append(builder.fsub(own, gather(builder, place, indices), flags=FAST))
+                square = multiply_add(builder, apart[-1], apart[-1], square)
+            inverse_r = builder.fdiv(one, square_root(builder, square))
+            share = builder.fmul(builder.fmul(square, inverse_r, flags=FAST), inverse_, flags=FAST)
+            u = builder.fsub(one, share, flags=FAST)
+            length = builder.fmul(slope_, u, flags=FAST)
+            factor = builder.fmul(length, inverse_r, flags=FAST)
+            u2 = builder.fmul(u, u, flags=FAST)
+            new = [builder.fadd(sums[0], u2, flags=FAST), multiply_add(builder, u2, u, sums[1])]
+            new.append(multiply_add(builder, length, length, sums[2]))
+            store(builder, u, rows[3], k)
+            for axis in range(3):
+                component = builder.fmul(factor, apart[axis], flags=FAST)
+                store(builder, component, rows[axis], k)
+                new.append(builder.fadd(sums[3 + axis], component, flags=FAST))
+            return new
+
+        sums = vector_loop(builder, start_, end_, 6, body)
+        total = [lane_sum(builder, value) for value in sums]
+        return context.make_tuple(builder, sig.return_type, total)
+
+    return signature, codegen
+
+
+@inlined
+def _geometry_by_hand(pairs, columns, i, slope, inverse_h):
+    return _geometry_in_vectors(
+        pairs.neighbors,
+        pairs.gradients,
+        columns,
+        pairs.start[i],
+        pairs.end[i],
+        (columns[0, i], columns[1, i], columns[2, i]),
+        slope,
+        inverse_h,
+    )
+
+
+@inlined
+def _geometry_plainly(pairs, columns, i, slope, inverse_h):
+    one = np.float32(1.0)
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    x, y, z = xs[i], ys[i], zs[i]
+    w, n, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    start, end = pairs.start[i], pairs.end[i]
+    js = pairs.neighbors[start:end]
+    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+    gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+    # One loop for each array written: with more the compiler gives up proving that they do not
+    # overlap with those read, and makes no vector code.
+    for k in range(js.shape[0]):
+        j = js[k]
+        dx = x - xs[j]
+        dy = y - ys[j]
+        dz = z - zs[j]
+        us[k] = dx * dx + dy * dy + dz * dz + np.float32(TINY)
+    for k in range(js.shape[0]):
+        r2 = us[k]
+        inverse_r = one / np.sqrt(r2)
+        u = one - r2 * inverse_r * inverse_h
+        us[k] = u
+        gx[k] = slope * u * inverse_r
+        w += u * u
+        n += u * u * u
+        square += slope * slope * u * u
+    for k in range(js.shape[0]):
+        c = gx[k] * (y - ys[js[k]])
+        gy[k] = c
+        ty += c
+    for k in range(js.shape[0]):
+        c = gx[k] * (z - zs[js[k]])
+        gz[k] = c
+        tz += c
+    for k in range(js.shape[0]):
+        c = gx[k] * (x - xs[js[k]])
+        gx[k] = c
+        tx += c
+    return w, n, square, tx, ty, tz
+
+
+_geometry = _geometry_by_hand if HAS_GATHER else _geometry_plainly
+
+
+@inlined
+def geometry_of_pairs(pairs, columns, i, slope, inverse_h):
+    """Gradients of the pairs of particle i, and sums over them.
+
+    Args:
+        pairs: from `find_neighbors`; the gradients of i's pairs are written.
+        columns: as in `find_neighbors`.
+        i: row of the particle.
+        slope: derivative of the normalised density weight at r = 0 [1/m], float32.
+        inverse_h: 1 / h [1/m], float32.
+
+    Returns:
+        Sums of (1 - r/h)^2, (1 - r/h)^3 and slope^2 (1 - r/h)^2, in which a particle counts as its
+        own neighbour as often as the list has it; sum of the gradients, x, y, z.
+    """
+    return _geometry(pairs, columns, i, slope, inverse_h)
