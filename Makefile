@@ -62,17 +62,27 @@ bench: $(READY)
 	  echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit 1; \
 	done
 
-# The pictures of the README: last frames of offline runs, and the webcam's film; takes minutes.
+# The pictures of the README: last frames of offline runs, and the webcam's film; takes an hour. A scene
+# and the moment of its picture [s]:
+MOMENTS := desk_tank:0.5 dam_break:0.5 dam_break_2d:0.35 resting_column:0.5 pour_glass:1.2 dam_house_2d:1.8 \
+  drops_merge:0.3 stirred_cup:1.6 floating_boat:1.5 ball_splash:0.3 oil_water:1.2 fountain:1.2 \
+  honey_spoon:2 cream:3 jelly:0.1
+FFMPEG = "$$($(BIN)/python -c 'import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())')" -y -loglevel error
 pictures: $(READY)
-	$(BIN)/sph_ros simulate ball_tank_large --bag hand_stir --seconds 17.1 --fps 10 --out out/ball_tank --force
+	mkdir -p docs/scenes
+	$(BIN)/sph_ros simulate ball_tank_large --bag hand_stir --seconds 17.1 --fps 10 --out out/ball_tank_large --force
+	$(BIN)/sph_ros simulate ball_tank --bag hand_stir --seconds 10 --fps 1 --out out/ball_tank --force
 	$(BIN)/sph_ros simulate drop_box --bag hand_push --seconds 0.95 --fps 20 --out out/drop_box --force
-	$(BIN)/sph_ros simulate dam_break --seconds 0.5 --fps 20 --out out/dam_break --force
-	mkdir -p docs
-	for scene in ball_tank drop_box dam_break; do cp out/$$scene/last.png docs/$$scene.png || exit 1; done
+	for shot in $(MOMENTS); do scene=$${shot%:*}; \
+	  $(BIN)/sph_ros simulate $$scene --seconds $${shot#*:} --fps 20 --out out/$$scene --force || exit 1; done
+	$(BIN)/sph_ros simulate rain_2d --fps 1 --out out/rain_2d --force
+	cp out/ball_tank_large/last.png docs/ball_tank.png
+	for scene in ball_tank ball_tank_large drop_box rain_2d $(foreach shot,$(MOMENTS),$(firstword $(subst :, ,$(shot)))); do \
+	  $(FFMPEG) -i out/$$scene/last.png -vf scale=400:-1:flags=lanczos -c:v libwebp -quality 80 \
+	    docs/scenes/$$scene.webp || exit 1; done
 	$(BIN)/sph_ros webcam --make-video out/desk.mp4
 	$(BIN)/sph_ros webcam --source out/desk.mp4 --headless --rate 0.25 --out out/webcam --force
-	"$$($(BIN)/python -c 'import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())')" -y -loglevel error \
-	  -ss 1 -t 9 -i out/webcam/webcam.mp4 -vf fps=12,scale=480:-1:flags=lanczos \
+	$(FFMPEG) -ss 1 -t 9 -i out/webcam/webcam.mp4 -vf fps=12,scale=480:-1:flags=lanczos \
 	  -c:v libwebp_anim -quality 55 -compression_level 6 -loop 0 docs/webcam.webp
 
 clean:

@@ -110,6 +110,10 @@ def test_the_readme_names_every_program_scene_and_parameter():
     assert {name for name, _ in rows} == declared | {f"material.{field}" for field in RANGES}
     for field, (low, high) in RANGES.items():
         assert dict(rows)[f"material.{field}"].strip().replace(",", "") == f"{low:g} to {high:g}"
+    shown = re.findall(r"\]\(docs/scenes/(\w+)\.webp\)", readme)
+    assert sorted(shown) == list_scenes()
+    for name in shown:
+        assert 2_000 < (ROOT / f"docs/scenes/{name}.webp").stat().st_size < 60_000
     for picture in re.findall(r"\]\((docs/\w+\.png)\)", readme):
         assert 10_000 < (ROOT / picture).stat().st_size < 400_000
 
