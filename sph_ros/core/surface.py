@@ -220,8 +220,10 @@ def _grid_around(positions, spacing, support_radius, cell_size, dimension) -> Gr
     """The grid that holds all colour of these particles with a border of zeros."""
     margin = margin_nodes(spacing, support_radius, cell_size)
     cell = np.full(3, float(cell_size))
-    first = np.floor(positions.min(axis=0) / cell).astype(np.int64) - margin
-    last = np.floor(positions.max(axis=0) / cell).astype(np.int64) + 1 + margin
+    low = np.array([column.min() for column in positions.T])  # ten times as fast as along an axis
+    high = np.array([column.max() for column in positions.T])
+    first = np.floor(low / cell).astype(np.int64) - margin
+    last = np.floor(high / cell).astype(np.int64) + 1 + margin
     first = first.astype(np.float64)
     shape = (last - first + 1).astype(np.int64)
     if dimension == 2:  # planes at -0.75, -0.25, 0.25 and 0.75 spacings: the level lies at +-0.5
@@ -388,10 +390,16 @@ def _reached_nodes(knot, cell):
     return int(np.ceil(4.0 * knot / cell - 1e-6))
 
 
+@device
+def _first_node(coordinate, cell, first, shift, knot):
+    """First node along one axis that a particle's spline reaches."""
+    return int(np.ceil((coordinate - 2.0 * knot) / cell - first)) + shift
+
+
 @kernel
 def _axis_weights(coordinate, cell, first, shift, knot, axis_weights):  # the last is written
-    """Spline of one particle at the nodes along one axis; returns the first node and how many."""
-    begin = int(np.ceil((coordinate - 2.0 * knot) / cell - first)) + shift
+    """Spline of one particle at the nodes along one axis; returns the first node."""
+    begin = _first_node(coordinate, cell, first, shift, knot)
     count = len(axis_weights)
     for i in range(count):
         node = (begin + i - shift + first) * cell
@@ -426,6 +434,14 @@ def _splat(positions, shifts, cell, first, knot, flat, weights, field):  # the l
         if not flat:
             y = _axis_weights(positions[p, 1], cell[1], first[1], shifts[s, 1], knot, wy)
         z = _axis_weights(positions[p, 2], cell[2], first[2], shifts[s, 2], knot, wz)
+        if count == 4:  # as usual: the compiler makes one instruction of the innermost loop
+            for i in range(4):
+                for j in range(len(wy)):
+                    w = weights[p] * wx[i] * wy[j]
+                    row = field[x + i, y + j, z : z + 4]
+                    for k in range(4):
+                        row[k] += w * wz[k]
+            continue
         for i in range(count):
             for j in range(len(wy)):
                 w = weights[p] * wx[i] * wy[j]
@@ -448,20 +464,25 @@ def _lonely_weights(positions, shifts, cell, first, knot, flat, field, weights):
     middle = count // 2
     for p in range(len(positions)):
         s = p if len(shifts) > 1 else 0
-        x = _axis_weights(positions[p, 0], cell[0], first[0], shifts[s, 0], knot, wx)
+        x = _first_node(positions[p, 0], cell[0], first[0], shifts[s, 0], knot)
+        z = _first_node(positions[p, 2], cell[2], first[2], shifts[s, 2], knot)
         y = 1
         if not flat:
-            y = _axis_weights(positions[p, 1], cell[1], first[1], shifts[s, 1], knot, wy)
-        z = _axis_weights(positions[p, 2], cell[2], first[2], shifts[s, 2], knot, wz)
-        colour, total = 1.0, 1.0
-        if field[x + middle, y if flat else y + middle, z + middle] < INSIDE_COLOUR:
-            colour, total = 0.0, 0.0
-            for i in range(count):
-                for j in range(len(wy)):
-                    w = wx[i] * wy[j]
-                    for k in range(count):
-                        colour += w * wz[k] * field[x + i, y + j, z + k]
-                        total += w * wz[k]
+            y = _first_node(positions[p, 1], cell[1], first[1], shifts[s, 1], knot)
+        if field[x + middle, y if flat else y + middle, z + middle] >= INSIDE_COLOUR:
+            weights[p] = 0.0
+            continue
+        _axis_weights(positions[p, 0], cell[0], first[0], shifts[s, 0], knot, wx)
+        if not flat:
+            _axis_weights(positions[p, 1], cell[1], first[1], shifts[s, 1], knot, wy)
+        _axis_weights(positions[p, 2], cell[2], first[2], shifts[s, 2], knot, wz)
+        colour, total = 0.0, 0.0
+        for i in range(count):
+            for j in range(len(wy)):
+                w = wx[i] * wy[j]
+                for k in range(count):
+                    colour += w * wz[k] * field[x + i, y + j, z + k]
+                    total += w * wz[k]
         wanted = LONELY_COLOUR * total
         weights[p] = weights[p] * (wanted / colour - 1.0) if colour < wanted else 0.0
 
