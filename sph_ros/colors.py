@@ -64,7 +64,7 @@ def shaded_liquid(normals, color=LIQUID[:3]):
 
     Args:
         normals: unit outward normals, (V, 3), z up.
-        color: red, green, blue of the liquid.
+        color: red, green, blue of the liquid, (3,) or of each vertex (V, 3).
 
     Returns:
         red, green, blue, alpha (V, 4) float32: light from the sky and a soft gleam of the sun.

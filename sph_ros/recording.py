@@ -13,8 +13,7 @@ from msg_adapters.marker import MARKER, MARKER_ARRAY, marker_to_cdr, markers_to_
 from msg_adapters.point_cloud import POINT_CLOUD2, particle_cloud_to_cdr
 from msg_adapters.pose import POSE_STAMPED, pose_to_cdr
 from msg_adapters.wrench import WRENCH_STAMPED, wrench_to_cdr
-from sph_ros.colors import liquid_color
-from sph_ros.scene_markers import SolidMarkers, surface_marker
+from sph_ros.scene_markers import SolidMarkers, surface_color, surface_marker
 
 NODE = "/fluid"
 
@@ -105,7 +104,8 @@ class BagRecorder:
             wrench = wrench_to_cdr(*sim.wrench(name), stamp, self._frame_id)
             write(f"solids/{name}/wrench", WRENCH_STAMPED, wrench)
         if self._count % 2 == 0:
-            color = liquid_color(sim.material)
+            liquids = [sim.material, *sim.scene.liquids[1:]]
+            color = surface_color(liquids, surface[0], sim.positions, sim.families)
             marker = surface_marker(*surface, stamp, self._frame_id, color)
             write("surface", MARKER, marker_to_cdr(marker))
             write("solids", MARKER_ARRAY, markers_to_cdr(self._solids.at(stamp)))

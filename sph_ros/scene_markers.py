@@ -1,8 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulation as markers, the same on topics and in bags: the liquid's surface and the solids."""
 
+import numpy as np
+from scipy.spatial import cKDTree
+
 from msg_adapters.marker import triangle_marker
-from sph_ros.colors import LIQUID, shaded_liquid, solid_colors
+from sph_ros.colors import LIQUID, liquid_color, shaded_liquid, solid_colors
+
+
+def surface_color(liquids, vertices, positions, families):
+    """Color of a surface: red, green, blue, alpha, or where liquids meet red, green, blue (V, 3).
+
+    Args:
+        liquids: materials of the scene's liquids.
+        vertices: of the surface [m], (V, 3); each has the colour of the nearest particle.
+        positions: of the particles [m], (N, 3).
+        families: index into `liquids` of each particle, (N,).
+    """
+    if len(liquids) == 1 or not len(vertices):
+        return liquid_color(liquids[0])
+    table = np.array([liquid_color(material)[:3] for material in liquids])
+    return table[families[cKDTree(positions).query(vertices)[1]]]
 
 
 def surface_marker(vertices, triangles, normals, stamp_ns, frame_id, color=LIQUID):
@@ -18,16 +36,17 @@ def surface_marker(vertices, triangles, normals, stamp_ns, frame_id, color=LIQUI
         normals: of the vertices, unit and outward, (V, 3).
         stamp_ns: [ns].
         frame_id: of the vertices.
-        color: red, green, blue, alpha.
+        color: red, green, blue, alpha, or those of each vertex without alpha, (V, 3).
     """
+    several = np.ndim(color) == 2
     return triangle_marker(
         vertices,
         triangles,
         stamp_ns,
         frame_id,
         namespace="surface",
-        color=color[:3],
-        vertex_colors=shaded_liquid(normals, color[:3]),
+        color=LIQUID[:3] if several else color[:3],
+        vertex_colors=shaded_liquid(normals, color if several else color[:3]),
     )
 
 

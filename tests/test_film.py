@@ -6,9 +6,9 @@ import numpy as np
 
 from msg_adapters.marker import DELETE
 from sph_ros import film
-from sph_ros.colors import CONTAINER, solid_colors, speed_colors
+from sph_ros.colors import CONTAINER, liquid_color, solid_colors, speed_colors
 from sph_ros.core.surface import extract_surface
-from sph_ros.scene_markers import SolidMarkers, surface_marker
+from sph_ros.scene_markers import SolidMarkers, surface_color, surface_marker
 from sph_ros.sim.scene import load_scene
 from sph_ros.sim.simulation import Simulation
 
@@ -94,6 +94,26 @@ def test_the_surface_is_shaded_smoothly_and_opaque():
     bright, dark = marker.points[order[-20:]], marker.points[order[:20]]
     assert bright[:, 2].min() > 0.5 > -0.5 > dark[:, 2].max()
     assert np.linalg.norm(bright.mean(axis=0)) > 0.9
+
+
+def test_each_of_several_liquids_has_its_colour_on_the_surface():
+    oil = {"box": {"min": [0.1, 0, 0], "max": [0.2, 0.1, 0.1]}, "material": "oil"}
+    scene = load_scene(
+        {
+            "spacing": 0.02,
+            "solver": "none",
+            "liquid": [{"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}}, oil],
+        }
+    )
+    sim = Simulation(scene)
+    vertices, triangles, normals = extract_surface(sim.positions, 0.02)
+    color = surface_color(scene.liquids, vertices, sim.positions, sim.families)
+    marker = surface_marker(vertices, triangles, normals, 5, "pool", color)
+    blueish = marker.colors[:, 2] > marker.colors[:, 0]
+    left, right = marker.points[:, 0] < 0.09, marker.points[:, 0] > 0.11  # of where they meet
+    assert blueish[left].mean() > 0.98 and blueish[right].mean() < 0.02
+    alone = surface_color(scene.liquids[:1], vertices, sim.positions, None)
+    assert alone == liquid_color(scene.material)
 
 
 def test_speeds_go_from_deep_blue_to_white_and_stand_nan():

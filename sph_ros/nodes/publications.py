@@ -15,9 +15,8 @@ from msg_adapters.marker import delete_marker, marker_to_cdr, markers_to_cdr
 from msg_adapters.mesh import mesh_to_cdr
 from msg_adapters.point_cloud import particle_cloud_to_cdr
 from msg_adapters.wrench import wrench_to_cdr
-from sph_ros.colors import liquid_color
 from sph_ros.core.surface import extract_surface
-from sph_ros.scene_markers import SolidMarkers, surface_marker
+from sph_ros.scene_markers import SolidMarkers, surface_color, surface_marker
 from sph_ros.sim.scene_types import Scene
 
 #: A depth of one loses messages of some megabytes.
@@ -31,11 +30,13 @@ class SurfaceJob(NamedTuple):
         positions: [m], (N, 3) float32.
         stamp_ns: of the positions [ns].
         scene: that they belong to.
+        families: which of its liquids each particle is of, (N,) uint8; None: all of the first.
     """
 
     positions: np.ndarray
     stamp_ns: int
     scene: Scene
+    families: np.ndarray | None = None
 
 
 class Publications:
@@ -91,7 +92,10 @@ class Publications:
         if _heard(self._solids):
             self._publish_solids(stamp_ns)
         self._publish_wrenches(stamp_ns)
-        return SurfaceJob(positions, stamp_ns, sim.scene) if wants_surface else None
+        if not wants_surface:
+            return None
+        families = sim.families if len(sim.scene.liquids) > 1 else None
+        return SurfaceJob(positions, stamp_ns, sim.scene, families)
 
     def surface(self, job):
         """Extract and publish a surface; returns its number of triangles. For any thread."""
@@ -100,7 +104,7 @@ class Publications:
             job.positions, scene.spacing, scene.support_radius, dimension=scene.dimension
         )
         if _heard(self._surface):
-            color = liquid_color(scene.material)
+            color = surface_color(scene.liquids, vertices, job.positions, job.families)
             marker = surface_marker(vertices, triangles, normals, job.stamp_ns, scene.frame, color)
             self._surface.publish(marker_to_cdr(marker))
         if _heard(self._surface_mesh):
