@@ -16,11 +16,11 @@ from sph_ros.sim.simulation import Simulation
 SPACING, LAYERS, WIDTH = 0.01, 18, 10
 
 
-TABLES = {"relaxation": scales.FLOWED_SHARE, "forces": force_scales.FLOWED_SHARE}
+TABLES = {**scales.FLOWED_SHARE, "forces": force_scales.FLOWED_SHARE}
 
 
 def level(solver, dimension, ratio, share):
-    """Height of the topmost layer after shaking and rest, in spacings."""
+    """Level after shaking and rest, twice the height of the centre, in spacings."""
     TABLES[solver][dimension] = ((ratio, share),)
     width, height = WIDTH * SPACING, LAYERS * SPACING
     simulation = Simulation(
@@ -47,7 +47,7 @@ def level(solver, dimension, ratio, share):
     levels = []
     for _ in range(20):
         simulation.step()
-        levels.append(np.percentile(simulation.positions[:, 2], 100 - 50 / LAYERS) / SPACING)
+        levels.append(2.0 * simulation.positions[:, 2].mean(dtype=np.float64) / SPACING)
     return float(np.mean(levels))
 
 
@@ -59,8 +59,7 @@ def main():
     for solver, dimension, ratio in itertools.product(TABLES, (2, 3), (1.6, 2.0, 2.5, 3.0)):
         lattice = level(solver, dimension, ratio, 1.0)
         guess = level(solver, dimension, ratio, 0.95)
-        wanted = LAYERS - 0.5
-        share = 1.0 - 0.05 * (wanted - lattice) / (guess - lattice)
+        share = 1.0 - 0.05 * (LAYERS - lattice) / (guess - lattice)
         print(
             f"{solver:>10} {dimension:>9} {ratio:>11.1f} {lattice:>14.2f} {share:>7.3f}", flush=True
         )

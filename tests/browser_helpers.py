@@ -31,7 +31,7 @@ SIZE = {"width": 1000, "height": 640}
 RESOLUTION = 0.5
 
 #: Longest wait for anything on a page [ms].
-PATIENCE = 30_000
+PATIENCE = 60_000
 
 
 @contextmanager

@@ -55,6 +55,7 @@ def searched(points):
         np.float32(1 / FULL),
         np.float32(1 / NEAR_FULL),
         work.contacts.density,
+        work.chunks,
         work.pairs,
         work.sums,
     )

@@ -325,6 +325,35 @@ def test_a_marker_that_jumps_does_not_splatter_the_drop(solver):
     assert sim.statistics()["max_speed"] < 0.5
 
 
+def test_stirring_leaves_the_volume_as_it_was_at_rest():
+    """The start is a lattice, what was stirred is none, and both take the same room."""
+    side, depth, spacing = 0.12, 0.08, 0.01
+    sim = sph_ros.Simulation(
+        {
+            "solver": "incompressible",
+            "spacing": spacing,
+            "liquid": [{"box": {"min": [0, 0, 0], "max": [side, side, depth]}}],
+            "solids": [tank([side, side, 0.3])],
+        }
+    )
+
+    def level():
+        heights = []
+        for _ in range(20):
+            sim.step()
+            heights.append(2 * sim.positions[:, 2].mean(dtype=np.float64))
+        return np.mean(heights)
+
+    sim.advance(1.0)
+    before = level()
+    shake = np.random.default_rng(5).normal(0.0, 0.5, (sim.particle_count, 3))
+    sim._fluid.velocities += shake.astype(np.float32)
+    sim.advance(1.5)
+    after = level()
+    assert after == pytest.approx(before, rel=0.01)
+    assert after == pytest.approx(depth, rel=0.025)
+
+
 def test_a_column_of_many_fine_layers_collapses_without_bursting():
     """160 layers: what one layer more or less is wrong adds up over all of them."""
     depth = 0.32

@@ -112,7 +112,7 @@ class Stage:
 
 
 @pytest.fixture(scope="module")
-def stage(tmp_path_factory):
+def stage(tmp_path_factory, compiled_liquid):
     with RosSession("browser") as ros:
         yield Stage(ros, tmp_path_factory.mktemp("viewer"))
 

@@ -13,11 +13,14 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.jit import device, kernel, parallel_kernel
-from sph_ros.core.pair_sums import LIST_STEP, geometry_of_pairs
+from sph_ros.core.pair_sums import geometry_of_pairs
 from sph_ros.core.vector import LANES, append_within
 
 #: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
 CHUNK = 256
+
+#: Lists have a multiple of so many entries.
+LIST_STEP = 8
 
 
 class Grid(NamedTuple):
@@ -221,7 +224,7 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     starts, ends, counts = pairs.start, pairs.end, pairs.count
     for chunk in prange(chunks):
         cursor = np.intp(chunk * room)
-        limit = cursor + room
+        limit = cursor + room - LANES  # vectors may reach beyond the last list
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             start = cursor
             cursor = append_neighbors(i, columns, grid, square, pairs.neighbors, cursor, limit)
@@ -236,7 +239,9 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
 
 
 @parallel_kernel
-def sum_densities(columns, support_radius, density_scale, near_scale, wall_density, pairs, sums):
+def sum_densities(
+    columns, support_radius, density_scale, near_scale, wall_density, chunks, pairs, sums
+):
     """Pair geometry, both densities and gradient sums of every particle (Clavet 2005, Alg. 2).
 
     Args:
@@ -244,6 +249,7 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
         support_radius: h [m], float32.
         density_scale, near_scale: 1 / lattice sums of the two weights [-], float32.
         wall_density: density and near-density that walls add [-], (N, 2).
+        chunks: `chunk_count(N)`.
         pairs: `gradients` is written.
         sums: all written.
     """
@@ -251,17 +257,20 @@ def sum_densities(columns, support_radius, density_scale, near_scale, wall_densi
     slope = np.float32(-2.0) * density_scale * inverse_h
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
-    for i in prange(pairs.start.shape[0]):
-        w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h)
-        # Each entry that only fills the list has counted as the particle itself, with weight 1.
-        filling = np.float32(pairs.end[i] - pairs.start[i] - pairs.count[i])
-        density[i] = density_scale * (w - filling) + wall_density[i, 0]
-        near_density[i] = near_scale * (n - filling) + wall_density[i, 1]
-        gradient[i, 0] = x
-        gradient[i, 1] = y
-        gradient[i, 2] = z
-        # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
-        gradient_square[i] = square - slope * slope * (filling + np.float32(1.0))
+    count = pairs.start.shape[0]
+    # By chunks, in order: a list may spoil the beginning of the one behind it.
+    for chunk in prange(chunks):
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h)
+            # Each entry that only fills the list has counted as the particle itself, with weight 1.
+            filling = np.float32(pairs.end[i] - pairs.start[i] - pairs.count[i])
+            density[i] = density_scale * (w - filling) + wall_density[i, 0]
+            near_density[i] = near_scale * (n - filling) + wall_density[i, 1]
+            gradient[i, 0] = x
+            gradient[i, 1] = y
+            gradient[i, 2] = z
+            # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
+            gradient_square[i] = square - slope * slope * (filling + np.float32(1.0))
 
 
 @parallel_kernel

@@ -18,7 +18,6 @@ from sph_ros.core.vector import (
     FLOATS,
     HAS_GATHER,
     INTS,
-    LANES,
     constant,
     data_pointer,
     gather,
@@ -32,9 +31,6 @@ from sph_ros.core.vector import (
     store,
     vector_loop,
 )
-
-#: Lists of neighbours have a multiple of so many entries.
-LIST_STEP = LANES if HAS_GATHER else 8
 
 #: Numbers in a packed displacement are whole multiples of `REACH` support radii / 2^20.
 REACH = np.float32(4.0)
@@ -76,12 +72,12 @@ def unpacked(word):
     return np.float32((word << 32) >> 43), np.float32(word >> 43), np.float32(z)
 
 
-def _unpacked(builder, source, indices):
+def _unpacked(builder, source, indices, mask):
     """Components of the packed displacements source[indices], vectors of floats, in their unit."""
-    low, high = gather_words(builder, source, indices)
-    eleven, mask = constant(11, INTS), constant(0x7FF, INTS)
-    z_low = builder.and_(low, mask)
-    z_high = builder.shl(builder.and_(high, mask), eleven)
+    low, high = gather_words(builder, source, indices, mask)
+    eleven, bits = constant(11, INTS), constant(0x7FF, INTS)
+    z_low = builder.and_(low, bits)
+    z_high = builder.shl(builder.and_(high, bits), eleven)
     z = builder.sub(builder.or_(z_low, z_high), constant(1 << 20, INTS))
     whole = builder.ashr(low, eleven), builder.ashr(high, eleven), z
     return [builder.sitofp(number, FLOATS) for number in whole]
@@ -103,11 +99,11 @@ def _push_in_vectors(typingctx, neighbors, gradients, values, start, end, own):
         source = data_pointer(context, builder, sig.args[2], values_)
         centre = splat(builder, own_)
 
-        def body(k, sums):
-            theirs = gather(builder, source, load(builder, js, k, INTS))
+        def body(k, mask, sums):
+            theirs = gather(builder, source, load(builder, js, k, mask, INTS), mask)
             both = builder.fadd(centre, theirs, flags=FAST)
             return [
-                multiply_add(builder, both, load(builder, row, k), value)
+                multiply_add(builder, both, load(builder, row, k, mask), value)
                 for row, value in zip(rows, sums, strict=True)
             ]
 
@@ -161,12 +157,12 @@ def _divergence_in_vectors(typingctx, neighbors, gradients, packed, start, end, 
         source = data_pointer(context, builder, sig.args[2], packed_)
         centre = [splat(builder, value) for value in (x_, y_, z_)]
 
-        def body(k, sums):
-            theirs = _unpacked(builder, source, load(builder, js, k, INTS))
+        def body(k, mask, sums):
+            theirs = _unpacked(builder, source, load(builder, js, k, mask, INTS), mask)
             total = sums[0]
             for row, own, other in zip(rows, centre, theirs, strict=True):
                 way = builder.fsub(own, other, flags=FAST)
-                total = multiply_add(builder, load(builder, row, k), way, total)
+                total = multiply_add(builder, load(builder, row, k, mask), way, total)
             return [total]
 
         return lane_sum(builder, vector_loop(builder, start_, end_, 1, body)[0])
@@ -247,24 +243,24 @@ def _growth_in_vectors(
         own_way = [splat(builder, builder.extract_value(way_, axis)) for axis in range(3)]
         unit_, inverse_ = splat(builder, unit_), splat(builder, inverse_)
 
-        def body(k, sums):
+        def body(k, mask, sums):
             grown, linear = sums
-            indices = load(builder, js, k, INTS)
+            indices = load(builder, js, k, mask, INTS)
             square = None
-            theirs = _unpacked(builder, source, indices)
+            theirs = _unpacked(builder, source, indices, mask)
             for axis, other in enumerate(theirs):
                 relative = builder.fsub(own_way[axis], other, flags=FAST)
                 relative = builder.fmul(relative, unit_, flags=FAST)
-                linear = multiply_add(builder, load(builder, rows[axis], k), relative, linear)
-                there = gather(builder, places[axis], indices)
+                linear = multiply_add(builder, load(builder, rows[axis], k, mask), relative, linear)
+                there = gather(builder, places[axis], indices, mask)
                 apart = builder.fadd(
                     builder.fsub(centre[axis], there, flags=FAST), relative, flags=FAST
                 )
                 term = builder.fmul(apart, apart, flags=FAST)
                 square = term if square is None else builder.fadd(square, term, flags=FAST)
             share = builder.fmul(square_root(builder, square), inverse_, flags=FAST)
-            u = positive(builder, builder.fsub(constant(1.0), share, flags=FAST))
-            before = load(builder, rows[3], k)
+            u = positive(builder, builder.fsub(constant(1.0), share, flags=FAST), mask)
+            before = load(builder, rows[3], k, mask)
             grown = multiply_add(builder, u, u, grown)
             grown = builder.fsub(grown, builder.fmul(before, before, flags=FAST), flags=FAST)
             return [grown, linear]
@@ -361,15 +357,15 @@ def _geometry_in_vectors(
         slope_, inverse_ = splat(builder, slope_), splat(builder, inverse_)
         one, tiny = constant(1.0), constant(TINY)
 
-        def body(k, sums):
-            indices = load(builder, js, k, INTS)
+        def body(k, mask, sums):
+            indices = load(builder, js, k, mask, INTS)
             square, apart = tiny, []
             for place, own in zip(places, centre, strict=True):
-                apart.append(builder.fsub(own, gather(builder, place, indices), flags=FAST))
+                apart.append(builder.fsub(own, gather(builder, place, indices, mask), flags=FAST))
                 square = multiply_add(builder, apart[-1], apart[-1], square)
             inverse_r = builder.fdiv(one, square_root(builder, square))
             share = builder.fmul(builder.fmul(square, inverse_r, flags=FAST), inverse_, flags=FAST)
-            u = builder.fsub(one, share, flags=FAST)
+            u = builder.select(mask, builder.fsub(one, share, flags=FAST), constant(0.0))
             length = builder.fmul(slope_, u, flags=FAST)
             factor = builder.fmul(length, inverse_r, flags=FAST)
             u2 = builder.fmul(u, u, flags=FAST)
@@ -454,7 +450,8 @@ def geometry_of_pairs(pairs, columns, i, slope, inverse_h):
     """Gradients of the pairs of particle i, and sums over them.
 
     Args:
-        pairs: from `find_neighbors`; the gradients of i's pairs are written.
+        pairs: from `find_neighbors`; the gradients of i's pairs are written, and sometimes those of
+            the pairs after them, which must not have been written yet.
         columns: as in `find_neighbors`.
         i: row of the particle.
         slope: derivative of the normalised density weight at r = 0 [1/m], float32.

@@ -22,8 +22,6 @@ grid; no part of it vanishes.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sph_ros.core.jit import device, kernel
 from sph_ros.core.marching import marching_cubes
@@ -309,14 +307,7 @@ def _cut_at_walls(mesh, walls) -> Surface:
     """Move what is behind a wall onto it, and drop what is behind it altogether."""
     vertices, normals = mesh.vertices.copy(), mesh.normals.copy()
     count = len(vertices)
-    pairs = coo_matrix(
-        (
-            np.ones(2 * len(mesh.triangles), np.int8),
-            mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T,
-        ),
-        (count, count),
-    )
-    piece_count, piece = connected_components(pairs, directed=False)
+    piece_count, piece = _components(*mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T, count)
     kept = np.ones(piece_count, bool)
     for wall in walls:
         over = mesh.vertices @ wall[:3] - wall[3]
@@ -369,8 +360,16 @@ def _clusters(positions, edge, dimension):
             rows.append(found)
             columns.append(at[found])
     rows, columns = np.concatenate(rows), np.concatenate(columns)
-    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (len(keys), len(keys)))
-    return connected_components(links, directed=False)[1][inverse]
+    return _components(rows, columns, len(keys))[1][inverse]
+
+
+def _components(rows, columns, count):
+    """Number of connected components of `count` nodes, and that of each node; links of nodes."""
+    from scipy.sparse import coo_matrix  # slow to import, and few programs need it
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (count, count))
+    return connected_components(links, directed=False)
 
 
 @device

@@ -56,12 +56,12 @@ def data_pointer(context, builder, array_type, array, row=None):
     return builder.gep(view.data, [builder.mul(length, ir.Constant(length.type, row))])
 
 
-def load(builder, pointer, index, vector_type=FLOATS):
-    """The vector that begins at pointer[index]."""
+def load(builder, pointer, index, mask=None, vector_type=FLOATS):
+    """The vector that begins at pointer[index], 0 where not `mask`; all 16 elements are read."""
     place = builder.gep(pointer, [index])
     vector = builder.load(builder.bitcast(place, vector_type.as_pointer()), typ=vector_type)
     vector.align = 4
-    return vector
+    return vector if mask is None else builder.select(mask, vector, ir.Constant(vector_type, None))
 
 
 def store(builder, vector, pointer, index):
@@ -70,24 +70,21 @@ def store(builder, vector, pointer, index):
     builder.store(vector, builder.bitcast(place, vector.type.as_pointer())).align = 4
 
 
-def gather(builder, pointer, indices):
-    """Elements pointer[indices] of four bytes, as floats; needs `HAS_GATHER`."""
+def gather(builder, pointer, indices, mask):
+    """Elements pointer[indices] of 4 bytes, as floats, 0 where not `mask`; needs `HAS_GATHER`."""
     arguments = [FLOATS, _BYTES, INTS, _BITS, ir.IntType(32)]
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(FLOATS, arguments), "llvm.x86.avx512.mask.gather.dps.512"
     )
     place = builder.bitcast(pointer, _BYTES)
     size = ir.Constant(ir.IntType(32), 4)
-    return builder.call(function, [constant(0.0), place, indices, constant(1, _BITS), size])
+    return builder.call(function, [constant(0.0), place, indices, mask, size])
 
 
-def gather_words(builder, pointer, indices):
-    """Elements pointer[indices] of eight bytes as two vectors, lower and upper half of each."""
-    words, mask = (
-        ir.VectorType(ir.IntType(64), LANES // 2),
-        ir.VectorType(ir.IntType(1), LANES // 2),
-    )
-    arguments = [words, _BYTES, _HALF, mask, ir.IntType(32)]
+def gather_words(builder, pointer, indices, mask):
+    """Elements pointer[indices] of 8 bytes as two vectors, lower and upper half of each."""
+    words, bits = (ir.VectorType(ir.IntType(size), LANES // 2) for size in (64, 1))
+    arguments = [words, _BYTES, _HALF, bits, ir.IntType(32)]
     function = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(words, arguments), "llvm.x86.avx512.mask.gather.dpq.512"
     )
@@ -97,7 +94,8 @@ def gather_words(builder, pointer, indices):
     for first in (0, LANES // 2):
         lanes = ir.Constant(_HALF, list(range(first, first + LANES // 2)))
         half = builder.shuffle_vector(indices, ir.Constant(INTS, ir.Undefined), lanes)
-        found = builder.call(function, [constant(0, words), place, half, constant(1, mask), size])
+        allowed = builder.shuffle_vector(mask, ir.Constant(_BITS, ir.Undefined), lanes)
+        found = builder.call(function, [constant(0, words), place, half, allowed, size])
         pieces.append(builder.bitcast(found, INTS))
     return [
         builder.shuffle_vector(*pieces, ir.Constant(INTS, list(range(which, 2 * LANES, 2))))
@@ -118,10 +116,11 @@ def square_root(builder, vector):
     return builder.call(function, [vector])
 
 
-def positive(builder, vector):
-    """The floats of a vector, 0 instead of those that are less."""
+def positive(builder, vector, mask):
+    """The floats of a vector, 0 instead of those that are less and of those not in `mask`."""
     zero = constant(0.0)
-    return builder.select(builder.fcmp_ordered(">", vector, zero), vector, zero)
+    kept = builder.and_(mask, builder.fcmp_ordered(">", vector, zero))
+    return builder.select(kept, vector, zero)
 
 
 def lane_sum(builder, vector):
@@ -140,7 +139,8 @@ def vector_loop(builder, start, end, count, body):
     Args:
         start, end: indices.
         count: of sums.
-        body: called with the index and the sums so far; returns the new ones.
+        body: called with the index, the lanes that are before the end, and the sums so far; returns
+            the new sums.
 
     Returns:
         The sums, vectors of floats.
@@ -155,7 +155,11 @@ def vector_loop(builder, start, end, count, body):
     sums = [builder.phi(FLOATS) for _ in range(count)]
     for value in sums:
         value.add_incoming(constant(0.0), entry)
-    new = body(index, sums)
+    rest = builder.trunc(builder.sub(end, index), ir.IntType(32))
+    mask = builder.icmp_signed(
+        "<", ir.Constant(INTS, list(range(LANES))), splat(builder, rest, INTS)
+    )
+    new = body(index, mask, sums)
     following = builder.add(index, ir.Constant(index.type, LANES))
     last = builder.block
     index.add_incoming(following, last)

@@ -37,7 +37,8 @@ STEEPEST = 1.0
 #: particles that are pushed, not dropped, have one that their speed says nothing about.
 SURGE, PEAKS = 0.7, 0.005
 
-#: Particles below this density are at a free surface; there is one if so many are [-].
+#: Particles below this density, or pressed by less than a layer's weight, are at a free surface;
+#: there is one if so many are [-].
 SURFACE_DENSITY, SURFACE_SHARE = 0.85, 0.01
 
 #: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
@@ -118,10 +119,7 @@ class IncompressibleSolver(PressureSolver):
         self._clock("pressure")
         self._move(fluid, time_step)
         self._clock("finish")
-        # Flowed liquid packs less well than the lattice. Where it has no room for that, because it
-        # fills a closed container, the rest density stays that of the lattice.
-        exposed = np.count_nonzero(work.sums.density < SURFACE_DENSITY)
-        if exposed > SURFACE_SHARE * len(fluid):
+        if self._has_room(fluid):
             # Where it got room late, no faster than it melts: all at once it would leap.
             most = packing(self._scene, MELTING_TIME) - packing(self._scene, 0.0)
             grown = self._packing + most * time_step / MELTING_TIME
@@ -131,6 +129,18 @@ class IncompressibleSolver(PressureSolver):
         else:
             self._make_lists(fluid)
         return work.reactions.sum(axis=0)
+
+    def _has_room(self, fluid):
+        """Whether the liquid can take more room than the lattice it started on.
+
+        Flowed liquid packs less well. Where it has no room for that, because it fills a closed
+        container, it is pressed everywhere, and the rest density stays that of the lattice.
+        """
+        layer = (
+            self.scales.rest_density * float(np.linalg.norm(self._gravity)) * self._scene.spacing
+        )
+        free = (self._work.sums.density < SURFACE_DENSITY) | (fluid.pressures < layer)
+        return np.count_nonzero(free) > SURFACE_SHARE * len(fluid)
 
     def densities(self, fluid):
         """Densities at the present positions relative to rest [-], (N,), rows as in `fluid`."""

@@ -171,6 +171,12 @@ class LeapfrogSolver(Solver):
         h, s, d = self._scene.support_radius, self._scene.spacing, self._scene.dimension
         scales = [np.float32(1.0 / lattice_sum(power, h, s, d)) for power in POWERS]
         search.sum_densities(
-            work.columns, self._h, *scales, work.contacts.density, work.pairs, work.sums
+            work.columns,
+            self._h,
+            *scales,
+            work.contacts.density,
+            work.chunks,
+            work.pairs,
+            work.sums,
         )
         return twin.public(work.sums.density)[fluid.particle]

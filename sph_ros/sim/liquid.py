@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sph_ros.core.distances import signed_distances
 from sph_ros.sim.quaternions import to_matrix
@@ -159,6 +158,8 @@ def _is_new(points, earlier, scene, index):
     for block in scene.liquid[:index]:
         new &= distances_to(block.shape, block.pose, points, scene) > 0.0
     if len(earlier) and len(points):
+        from scipy.spatial import cKDTree  # slow to import, and few scenes have two blocks
+
         distance, _ = cKDTree(earlier).query(points, distance_upper_bound=scene.spacing)
         new &= distance > _NEAREST * scene.spacing
     return new

@@ -92,6 +92,7 @@ class PressureSolver(Solver):
             np.float32(self.scales.density_scale * self._packing),
             np.float32(self.scales.near_scale),
             work.contacts.density,
+            work.chunks,
             work.pairs,
             work.sums,
         )

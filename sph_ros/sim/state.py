@@ -180,7 +180,7 @@ class Workspace:
         "scales": (0, np.float32),
     }
 
-    def __init__(self, capacity, solids, slots=None, pairs_per_particle=56):
+    def __init__(self, capacity, solids, slots=None, pairs_per_particle=40):
         """Allocate for `capacity` particles, all of which are there.
 
         Args:
@@ -253,7 +253,7 @@ class Workspace:
 
     def enlarge_pairs(self):
         """More room for neighbours, after a search that found too little."""
-        self._allocate_pairs(2 * self.pairs_per_particle)
+        self._allocate_pairs(self.pairs_per_particle + 4 + self.pairs_per_particle // 16)
         self._fit_pairs()
 
 
