@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from sph_ros.core.neighbors import bounding_box
 from sph_ros.core.surface import extract_surface
 from sph_ros.sim.emitters import Emitters
 from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
@@ -186,7 +187,11 @@ class Simulation:
 
     def _liquid_reach(self):
         """Distance of the farthest particle from the origin of the world, at least [m]."""
-        return float(np.linalg.norm(np.abs(self._fluid.positions).max(axis=0, initial=0.0)))
+        if not len(self._fluid):
+            return 0.0
+        lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
+        bounding_box(self._fluid.positions, lower, upper)
+        return float(np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper))))
 
     def advance(self, seconds):
         """Advance by whole steps until at least `seconds` [s] more are simulated."""
