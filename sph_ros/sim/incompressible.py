@@ -12,7 +12,14 @@ from sph_ros.core import relaxation as relax
 from sph_ros.sim.liquid import initial_length
 from sph_ros.sim.pressure import Goal
 from sph_ros.sim.pressure_solver import PressureSolver
-from sph_ros.sim.scales import MELTING_TIME, expected_speed, packing, viscous_rate
+from sph_ros.sim.scales import (
+    MELTING_TIME,
+    expected_speed,
+    packing,
+    stable_time_step,
+    viscous_rate,
+)
+from sph_ros.sim.surface_tension import SurfaceTension, noticeable, ripple_step
 
 #: Share of the support radius that the fastest expected particle crosses in a step.
 COURANT = 0.6
@@ -60,7 +67,12 @@ class IncompressibleSolver(PressureSolver):
 
     def stable_time_step(self):
         """A step that keeps the scene stable [s], and what bounds it."""
-        self._longest, reason = super().stable_time_step()
+        ripples = math.inf
+        if self._surface:
+            ripples = ripple_step(self._material, self._scene.spacing)
+        self._longest, reason = stable_time_step(
+            self._scene, self.scales, self._depth, self.courant, ripples
+        )
         return self._longest, reason
 
     def longest_step(self):
@@ -84,8 +96,9 @@ class IncompressibleSolver(PressureSolver):
         kinematic = LATTICE_VISCOSITY * scene.spacing * expected_speed(scene, self._depth)
         least = viscous_rate(kinematic, scene)
         self.scales = dataclasses.replace(
-            self.scales, viscous_rate=max(self.scales.viscous_rate, least)
+            self.scales, viscous_rate=max(self.scales.viscous_rate, least), cohesion=0.0, near=0.0
         )
+        self._surface = SurfaceTension(scene) if noticeable(material, scene) else None
 
     def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
@@ -208,10 +221,9 @@ class IncompressibleSolver(PressureSolver):
         """Displacements in this step under all forces, pressures included."""
         work = self._work
         unit = self._pressure_unit(time_step)
-        tension = self._tension(unit)
         if self._coupling is not None:
             self._coupling.predict()
-        self._pull_together(tension, time_step)
+        self._pull_together(time_step)
         self._pull_springs(fluid, time_step, time_step**2, work.cohesive)
         self._push_bodies(self._solids.bodies.inertias.centre)
         dt = np.float32(time_step)
@@ -250,6 +262,16 @@ class IncompressibleSolver(PressureSolver):
             rank = int((1.0 - PEAKS) * (len(fluid) - 1))
             self._pressed = float(np.partition(fluid.pressures, rank)[rank])
         self._push_bodies(self._solids.bodies.inertias.centre)
+
+    def _pull_together(self, time_step):
+        """Displacements by surface tension, into `cohesive`, and the reactions to them."""
+        if self._surface and self._work.count:
+            motion, mass = self._solids.motion, self.scales.mass
+            self._surface.displace(
+                self._work, self._grid_now, motion, self._material, mass, time_step
+            )
+        else:
+            self._work.cohesive[:] = 0.0
 
     def _move(self, fluid, time_step):
         """New positions, outside all solids, and velocities."""

@@ -230,7 +230,8 @@ def _take_every_way(scene, dimension):
     if scene["solids"]:
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
     simulation.step()
-    simulation.set_material(viscosity=0.001)
+    # So taut that it is noticed at this spacing.
+    simulation.set_material(viscosity=0.001, surface_tension=5.0)
     simulation.advance(0.02)
     simulation.statistics()
     simulation.surface()

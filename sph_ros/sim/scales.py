@@ -233,7 +233,7 @@ def expected_speed(scene, drop):
     return max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)
 
 
-def stable_time_step(scene, scales, drop, courant):
+def stable_time_step(scene, scales, drop, courant, ripples=math.inf):
     """A step that keeps the scene stable [s], and the reason in words.
 
     Args:
@@ -242,6 +242,7 @@ def stable_time_step(scene, scales, drop, courant):
         drop: height that the liquid can fall through [m].
         courant: share of the support radius that the fastest expected particle may cross. The
             speed also stands for the pressure, so this is the bound of the solver's stiffness.
+        ripples: step that the shortest waves of surface tension bear [s].
 
     Returns:
         The step, rounded down to a number people can read, and what bounds it.
@@ -252,6 +253,8 @@ def stable_time_step(scene, scales, drop, courant):
     soft = math.sqrt((scales.cohesion + scales.near) / scales.rest_density)
     if soft > 0:
         bounds["surface tension"] = 0.38 * h / soft
+    elif ripples < math.inf:
+        bounds["surface tension"] = ripples
     if scales.elasticity > 0:
         bounds["elasticity"] = longest_elastic_step(scales.elasticity / scales.rest_density, scene)
     reason = min(bounds, key=bounds.get)
