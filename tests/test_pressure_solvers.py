@@ -321,7 +321,12 @@ def test_a_marker_that_jumps_does_not_splatter_the_drop(solver):
         sim.advance(0.4)
     near = cKDTree(sim.positions).query_pairs(1.8 * sim.scene.spacing, output_type="ndarray")
     links = coo_array((np.ones(len(near)), near.T), shape=(sim.particle_count,) * 2)
-    assert connected_components(links, directed=False)[0] == 1
+    pieces = np.bincount(connected_components(links, directed=False)[1])
+    if solver == "relaxation":
+        assert len(pieces) == 1
+    else:
+        # A box of 0.4 m/s hits real water with a Weber number of 90: some drops fly off.
+        assert pieces[pieces >= 100].sum() > 0.97 * sim.particle_count
     assert sim.statistics()["max_speed"] < 0.5
 
 

@@ -61,7 +61,7 @@ class Pulls(NamedTuple):
     Attributes:
         colour: c [-], (N,).
         by_colour: de/dc [-], (N,).
-        by_gradient: de/d grad c [m], (N, 3).
+        by_gradient: de/d grad c [m], (3, N).
         normals: of the walls beside it, (N, 3, 3).
     """
 
@@ -91,13 +91,14 @@ def nearby_run(grid, x, y, z, run):
 
 
 @parallel_kernel
-def mark_surface(sums, contact_gradients, least, marks):
+def mark_surface(sums, contact_gradients, mirror, least, marks):
     """Mark particles whose neighbours lie on one side.
 
     Args:
         sums: from `sum_densities`.
         contact_gradients: gradient of the density that walls add, first three columns [1/m],
             (N, 6).
+        mirror: as in `find_pulls`.
         least: length of the gradient of the density from which on they do [1/m], float32.
         marks: (N,) uint8; written.
     """
@@ -106,7 +107,7 @@ def mark_surface(sums, contact_gradients, least, marks):
         square = np.float32(0.0)
         for axis in range(3):
             # Walls are mirrors, which move against the particle: half of the gradient is theirs.
-            g = gradient[i, axis] + np.float32(0.5) * contact_gradients[i, axis]
+            g = gradient[i, axis] + np.float32(0.5) * mirror * contact_gradients[i, axis]
             square += g * g
         marks[i] = square > least * least
 
@@ -205,11 +206,13 @@ def sum_colour(columns, grid, law, x, y, z):
 
 
 @parallel_kernel
-def find_pulls(columns, positions, grid, law, marks, near_solids, pairs, contacts, walls, pulls):
+def find_pulls(
+    columns, positions, grid, law, marks, near_solids, mirror, pairs, contacts, walls, pulls
+):
     """Colours of the particles near a surface, and what the energy makes of them.
 
     Beside a wall the liquid counts as if mirrored: the colour is divided by what the wall leaves
-    free, and the gradient has no part along the wall's normal.
+    free, and the gradient has no part along the wall's normal. So a wall neither draws nor repels.
 
     Args:
         columns: cell-sorted coordinates [m], (3, N + padding).
@@ -218,6 +221,7 @@ def find_pulls(columns, positions, grid, law, marks, near_solids, pairs, contact
         law: `Law`.
         marks: whether a particle is near a surface, (N,).
         near_solids: whether there are solids.
+        mirror: how much of a mirror walls are, 0 as if there were none, 1 fully [-], float32.
         pairs: neighbours within half the reach.
         contacts: with the solids.
         walls: colour of a flat wall at equally many distances from 0 to H/2 [-], (K,) float32.
@@ -230,16 +234,17 @@ def find_pulls(columns, positions, grid, law, marks, near_solids, pairs, contact
     for row in prange(marks.shape[0]):
         i = np.intp(row)
         colours[i], by_colour[i] = 1.0, 0.0
-        by_gradient[i, 0], by_gradient[i, 1], by_gradient[i, 2] = 0.0, 0.0, 0.0
+        by_gradient[0, i], by_gradient[1, i], by_gradient[2, i] = 0.0, 0.0, 0.0
         if marks[i] == 0:
             continue
         c, gx, gy, gz = sum_colour(columns, grid, law, xs[i], ys[i], zs[i])
         free = np.float32(1.0)
         if near_solids:
             found, free = look_at_walls(i, positions, pairs, contacts, walls, law.reach, normals[i])
+            free = np.float32(1.0) - mirror * (np.float32(1.0) - free)
             for k in range(found):
                 n = normals[i, k]
-                along = gx * n[0] + gy * n[1] + gz * n[2]
+                along = mirror * (gx * n[0] + gy * n[1] + gz * n[2])
                 gx -= along * n[0]
                 gy -= along * n[1]
                 gz -= along * n[2]
@@ -250,7 +255,7 @@ def find_pulls(columns, positions, grid, law, marks, near_solids, pairs, contact
         colours[i] = c
         by_colour[i] = -over * law.cohesion * max(law.full - c, zero)
         size = law.area * stretch * stretch / root
-        by_gradient[i, 0], by_gradient[i, 1], by_gradient[i, 2] = size * gx, size * gy, size * gz
+        by_gradient[0, i], by_gradient[1, i], by_gradient[2, i] = size * gx, size * gy, size * gz
 
 
 @parallel_kernel
@@ -271,17 +276,18 @@ def tension_displacements(columns, grid, law, marks, before, pulls, pull, displa
     by_colour, by_gradient = pulls.by_colour, pulls.by_gradient
     for i in prange(marks.shape[0]):
         x, y, z, own = xs[i], ys[i], zs[i], by_colour[i]
-        tx, ty, tz = by_gradient[i, 0], by_gradient[i, 1], by_gradient[i, 2]
+        tx, ty, tz = by_gradient[0, i], by_gradient[1, i], by_gradient[2, i]
         ax, ay, az = zero, zero, zero
         for run in range((2 * CELLS + 1) ** 2):
             begin, end = nearby_run(grid, x, y, z, run)
             if marks[i] == 0 and before[end] == before[begin]:
                 continue
             px, py, pz = columns[0, begin:end], columns[1, begin:end], columns[2, begin:end]
-            others, vectors = by_colour[begin:end], by_gradient[begin:end]
+            others, vx = by_colour[begin:end], by_gradient[0, begin:end]
+            vy, vz = by_gradient[1, begin:end], by_gradient[2, begin:end]
             for k in range(px.shape[0]):
                 dx, dy, dz = x - px[k], y - py[k], z - pz[k]
-                ux, uy, uz = tx - vectors[k, 0], ty - vectors[k, 1], tz - vectors[k, 2]
+                ux, uy, uz = tx - vx[k], ty - vy[k], tz - vz[k]
                 q = max(one - inverse * (dx * dx + dy * dy + dz * dz), zero)
                 w = q * q
                 along = w * (own + others[k]) + bend * q * (ux * dx + uy * dy + uz * dz)
@@ -303,9 +309,8 @@ def wall_tension(
         positions: [m], (N, 3).
         contacts, motion: of this substep.
         law, walls, pulls: as in `find_pulls`.
-        pull: as in `tension_displacements`.
-        hold: displacement by adhesion per gradient of the density that walls add; negative where
-            the liquid rather leaves the wall [m^2], float32.
+        pull: as in `tension_displacements`, times that part of the walls that is a mirror.
+        hold: displacement by adhesion per gradient of the density that walls add [m^2], float32.
         scale: particle mass / substep^2 [kg/s^2].
         displacements: [m], (N, 3); added to.
         reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.

@@ -81,9 +81,12 @@ def ripple_step(material, spacing):
     """Longest step that the shortest ripples bear [s] (Brackbill, Kothe & Zemach 1992).
 
     They take the mean density of both sides of the surface, here it is the liquid's: a step twice
-    as long still is stable, but noisy.
+    as long still is stable, but noisy. Walls that hold the liquid do so within half a spacing.
     """
-    return math.sqrt(material.density * spacing**3 / (2 * math.pi * material.surface_tension))
+    hold = 1.0 + 2.0 * max(2.0 * material.adhesion - 1.0, 0.0)
+    return math.sqrt(
+        material.density * spacing**3 / (2 * math.pi * hold * material.surface_tension)
+    )
 
 
 def shares(dimension, ratio):
@@ -125,7 +128,7 @@ class SurfaceTension:
         self.pulls = pull.Pulls(
             np.ones(count, np.float32),
             np.zeros(count, np.float32),
-            np.zeros((count, 3), np.float32),
+            np.zeros((3, count), np.float32),
             np.zeros((count, 3, 3), np.float32),
         )
 
@@ -144,7 +147,9 @@ class SurfaceTension:
             self._fit(work.count)
         scales, law = self.scales, self.scales.law
         unit = material.surface_tension * time_step**2 / material.density
-        self._find(work, grid, len(motion.position) > 0)
+        # Walls that the liquid avoids are less of a mirror, those that it seeks hold it.
+        mirror = min(2.0 * material.adhesion, 1.0)
+        self._find(work, grid, len(motion.position) > 0, mirror)
         pull.tension_displacements(
             work.columns,
             grid,
@@ -161,8 +166,8 @@ class SurfaceTension:
                 work.contacts,
                 motion,
                 law,
-                np.float32(unit / float(law.spacing)),
-                np.float32((2.0 * material.adhesion - 1.0) * scales.hold * unit),
+                np.float32(mirror * unit / float(law.spacing)),
+                np.float32(max(2.0 * material.adhesion - 1.0, 0.0) * scales.hold * unit),
                 scales.walls,
                 self.pulls,
                 np.float32(mass / time_step**2),
@@ -170,10 +175,16 @@ class SurfaceTension:
                 work.reactions,
             )
 
-    def _find(self, work, grid, solids):
+    def _find(self, work, grid, solids, mirror):
         """Which particles are near a surface, and what pulls at them."""
         marks, spread = self._marks, self._spread
-        pull.mark_surface(work.sums, work.contacts.gradients, np.float32(self.scales.mark), marks)
+        pull.mark_surface(
+            work.sums,
+            work.contacts.gradients,
+            np.float32(mirror),
+            np.float32(self.scales.mark),
+            marks,
+        )
         # The gradient of the colour goes two layers deeper than that of the density.
         pull.spread_marks(work.pairs, marks, spread)
         pull.spread_marks(work.pairs, spread, marks)
@@ -185,6 +196,7 @@ class SurfaceTension:
             self.scales.law,
             marks,
             solids,
+            np.float32(mirror),
             work.pairs,
             work.contacts,
             self.scales.walls,

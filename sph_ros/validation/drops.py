@@ -60,10 +60,14 @@ def _fit(times, values, guess):
 
 
 def laplace(case):
-    """Pressure inside a drop at rest: 2 sigma / R."""
+    """Pressure inside a drop at rest: 2 sigma / R.
+
+    The particles of a small drop arrange in shells, which bear unlike pressures, so the mean over
+    the whole drop is what counts; the plot shows the shells.
+    """
     radius = 0.01
     sim = case.simulation(
-        **SPACE, spacing=radius / case.pick(9, 6), liquid=[{"sphere": {"radius": radius}}]
+        **SPACE, spacing=radius / case.pick(9, 8), liquid=[{"sphere": {"radius": radius}}]
     )
     case.run(sim, case.pick(1.0, 0.6), words="drop comes to rest")
     edges = np.linspace(0.0, 1.2 * radius, 13)
@@ -79,18 +83,17 @@ def laplace(case):
     size = (3 / (4 * math.pi) * sim.particle_count * sim.scene.spacing**3) ** (1 / 3)
     truth = 2 * TENSION / size
     middle = 0.5 * (edges[1:] + edges[:-1])
-    inner = middle < 0.6 * radius
     filled = count > 0
     plot = Plot(
         "distance from the centre [m]",
         "pressure [Pa]",
         (
-            Curve("2 sigma / R", middle[inner], np.full(inner.sum(), truth), truth=True),
+            Curve("2 sigma / R", middle[filled], np.full(filled.sum(), truth), truth=True),
             Curve("measured", middle[filled], total[filled] / count[filled]),
         ),
     )
-    measured = float(total[inner].sum() / max(count[inner].sum(), 1))
-    return [relative_row("pressure inside a drop", truth, measured, "Pa", 0.15, plot=plot)]
+    measured = float(total.sum() / max(count.sum(), 1))
+    return [relative_row("mean pressure inside a drop", truth, measured, "Pa", 0.15, plot=plot)]
 
 
 def cube(case):
