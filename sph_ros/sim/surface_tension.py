@@ -26,7 +26,7 @@ SHARES = {
 MARK = 0.35
 
 #: Share of the weight's pressure below which surface tension is left out; see `noticeable`.
-LEAST_PRESSURE = 0.05
+LEAST_PRESSURE = 0.125
 
 #: Rows of the table of the walls' colour.
 ROWS = 65
@@ -71,7 +71,8 @@ def noticeable(material, scene):
     """Whether the scene's particles can show the surface tension of a material at all.
 
     The most curved surface that is resolved, of radius h, presses with 2 gamma / h. Where that is
-    less than `LEAST_PRESSURE` of the weight of a layer as thick, rho g h, it is left out.
+    less than `LEAST_PRESSURE` of the weight of a layer as thick, rho g h, it is left out: an eighth
+    means that h is more than four capillary lengths.
     """
     g, h = math.hypot(*scene.gravity), scene.support_radius
     return 2.0 * material.surface_tension > LEAST_PRESSURE * material.density * g * h**2
