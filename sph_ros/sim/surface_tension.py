@@ -17,6 +17,7 @@ FULL, BLUR = 0.95, 0.05
 
 #: Area and cohesion, a and b of the energy in units of surface tension / spacing, over h / spacing;
 #: by dimension. Measured by benchmarks/calibrate_tension.py: energy and pressure of a drop at rest.
+#: In three dimensions 2.5 and 3.0 are not: those of 2.0 stand for them.
 SHARES = {
     2: ((1.6, 2.721, 4.554), (2.0, 2.754, 3.966), (2.5, 2.992, 3.071), (3.0, 2.955, 2.841)),
     3: ((1.6, 2.422, 6.344), (2.0, 2.462, 5.904), (2.5, 2.462, 5.904), (3.0, 2.462, 5.904)),
