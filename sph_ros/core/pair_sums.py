@@ -9,6 +9,7 @@ of the elements.
 """
 
 import numpy as np
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
@@ -211,6 +212,110 @@ def divergence_of_pairs(pairs, displacements, packed, i, support_radius):
         support_radius: h [m], float32.
     """
     return _divergence(pairs, displacements, packed, i, support_radius)
+
+
+# ---------------------------------------------------------------- viscosity
+
+
+@intrinsic
+def _impulse_in_vectors(typingctx, neighbors, gradients, velocities, start, end, own, rates):
+    signature = types.UniTuple(types.float32, 3)(
+        neighbors, gradients, velocities, types.intp, types.intp, own, rates
+    )
+
+    def codegen(context, builder, sig, args):
+        neighbors_, gradients_, velocities_, start_, end_, own_, rates_ = args
+        js = data_pointer(context, builder, sig.args[0], neighbors_)
+        rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
+        source = data_pointer(context, builder, sig.args[2], velocities_)
+        sources = [builder.gep(source, [ir.Constant(start_.type, axis)]) for axis in range(3)]
+        centre = [splat(builder, builder.extract_value(own_, axis)) for axis in range(3)]
+        linear, quadratic, most = (
+            splat(builder, builder.extract_value(rates_, which)) for which in range(3)
+        )
+        one, columns = constant(1.0), constant(3, INTS)
+
+        def body(k, mask, sums):
+            indices = builder.mul(load(builder, js, k, mask, INTS), columns)
+            gradient = [load(builder, row, k, mask) for row in rows[:3]]
+            u = load(builder, rows[3], k, mask)
+            along = constant(0.0)
+            for slope, velocity, there in zip(gradient, centre, sources, strict=True):
+                relative = builder.fsub(velocity, gather(builder, there, indices, mask), flags=FAST)
+                along = multiply_add(builder, relative, slope, along)
+            inverse_u = builder.fdiv(one, builder.fadd(u, constant(1e-3), flags=FAST))
+            approach = builder.fmul(positive(builder, along, mask), inverse_u, flags=FAST)
+            wanted = multiply_add(builder, quadratic, approach, linear)
+            taken = builder.select(builder.fcmp_ordered("<", wanted, most), wanted, most)
+            share = builder.fmul(builder.fmul(u, taken, flags=FAST), along, flags=FAST)
+            share = builder.fmul(builder.fmul(share, inverse_u, flags=FAST), inverse_u, flags=FAST)
+            return [
+                multiply_add(builder, share, slope, value)
+                for slope, value in zip(gradient, sums, strict=True)
+            ]
+
+        sums = vector_loop(builder, start_, end_, 3, body)
+        total = [lane_sum(builder, value) for value in sums]
+        return context.make_tuple(builder, sig.return_type, total)
+
+    return signature, codegen
+
+
+@inlined
+def _impulse_by_hand(pairs, velocities, i, linear, quadratic, most):
+    return _impulse_in_vectors(
+        pairs.neighbors,
+        pairs.gradients,
+        velocities,
+        pairs.start[i],
+        pairs.end[i],
+        (velocities[i, 0], velocities[i, 1], velocities[i, 2]),
+        (linear, quadratic, most),
+    )
+
+
+@inlined
+def _impulse_plainly(pairs, velocities, i, linear, quadratic, most):
+    zero = np.float32(0.0)
+    vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
+    ax, ay, az = zero, zero, zero
+    start, end = pairs.start[i], pairs.end[i]
+    js = pairs.neighbors[start:end]
+    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
+    gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
+    for k in range(js.shape[0]):
+        j = js[k]
+        along = (
+            (vx - velocities[j, 0]) * gx[k]
+            + (vy - velocities[j, 1]) * gy[k]
+            + (vz - velocities[j, 2]) * gz[k]
+        )
+        inverse_u = np.float32(1.0) / (us[k] + np.float32(1e-3))
+        taken = min(linear + quadratic * max(along, zero) * inverse_u, most)
+        c = us[k] * taken * along * inverse_u * inverse_u
+        ax += c * gx[k]
+        ay += c * gy[k]
+        az += c * gz[k]
+    return ax, ay, az
+
+
+_impulse = _impulse_by_hand if HAS_GATHER else _impulse_plainly
+
+
+@inlined
+def impulse_of_pairs(pairs, velocities, i, linear, quadratic, most):
+    """Sum of (1 - r/h) q_ij g_ij ((v_i - v_j) . g_ij) / (1 - r/h)^2 over the neighbours of i.
+
+    With q_ij = min(linear + quadratic c_ij, most), and c_ij the speed at which i and j approach
+    each other, (v_i - v_j) . g_ij / (1 - r/h), or 0 if they do not.
+
+    Args:
+        pairs: from `sum_densities`.
+        velocities: [m/s], (N, 3).
+        i: row of the particle.
+        linear, quadratic, most: float32.
+    """
+    return _impulse(pairs, velocities, i, linear, quadratic, most)
 
 
 # ---------------------------------------------------------------- densities after displacements

@@ -21,7 +21,7 @@ from numba import prange
 
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
-from sph_ros.core.pair_sums import divergence_of_pairs, pack, push_by_pairs
+from sph_ros.core.pair_sums import divergence_of_pairs, impulse_of_pairs, pack, push_by_pairs
 
 
 class Tension(NamedTuple):
@@ -221,34 +221,12 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, changed)
         most: share of the relative speed that a pair at zero distance may take [-], float32.
         changed: velocities afterwards [m/s], (N, 3); written.
     """
-    zero = np.float32(0.0)
     inverse_slope2 = np.float32(1.0) / (slope * slope)
     for i in prange(velocities.shape[0]):
-        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
-        ax, ay, az = zero, zero, zero
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            u = us[k]
-            # Relative speed along the line from i to j, times slope u; positive: they approach.
-            along = (
-                (vx - velocities[j, 0]) * gx[k]
-                + (vy - velocities[j, 1]) * gy[k]
-                + (vz - velocities[j, 2]) * gz[k]
-            )
-            inverse_u = np.float32(1.0) / (u + np.float32(1e-3))
-            approach = max(along, zero) * inverse_u / slope
-            share = u * min(linear + quadratic * approach, most)
-            c = share * along * inverse_u * inverse_u * inverse_slope2
-            ax -= c * gx[k]
-            ay -= c * gy[k]
-            az -= c * gz[k]
-        changed[i, 0] = vx + ax
-        changed[i, 1] = vy + ay
-        changed[i, 2] = vz + az
+        x, y, z = impulse_of_pairs(pairs, velocities, i, linear, quadratic / slope, most)
+        changed[i, 0] = velocities[i, 0] - inverse_slope2 * x
+        changed[i, 1] = velocities[i, 1] - inverse_slope2 * y
+        changed[i, 2] = velocities[i, 2] - inverse_slope2 * z
 
 
 @parallel_kernel
