@@ -33,7 +33,7 @@ LONGEST = 900.0  # [s]
 FEATURES = ("bodies", "sheets", "meshes", "springs")
 
 #: Functions that the first scene of all needs, about: for reports of progress.
-FUNCTIONS = 160
+FUNCTIONS = 200
 
 _SCENE = {
     "spacing": 0.02,
@@ -114,6 +114,7 @@ def ensure_compiled(names=None):
     Args:
         names: from `needs`; all unless given.
     """
+    global _compiled
     if config.DISABLE_JIT or COMPILING in os.environ:
         return
     names = everything() if names is None else names
@@ -126,6 +127,8 @@ def ensure_compiled(names=None):
                 _run_children(jobs)
     except (OSError, subprocess.SubprocessError):
         return
+    finally:
+        _compiled = 0
 
 
 def _mark(name):
