@@ -14,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 import sph_ros
+from sph_ros.core import pressure
 from sph_ros.core import projection as project
-from sph_ros.core import relaxation as relax
+from sph_ros.sim.pressure import jacobi_share
 
 SOLVERS = ("relaxation", "incompressible")
 
@@ -95,7 +96,7 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
     work.displacements[:] = shift
     h = np.float32(scene.support_radius)
     none = np.zeros_like(work.scaled), work.contacts.gradients, work.displacements.copy()
-    relax.pressure_displacements(work.pairs, *none, h, work.displacements, work.packed)
+    pressure.pressure_displacements(work.pairs, *none, h, work.displacements, work.packed)
     scale = sim._solver.scales.density_scale * sim._solver._packing
     project.density_targets(
         work.columns,
@@ -110,6 +111,7 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
         np.float32(1.0),
         np.float32(0.01),
         work.targets,
+        work.residuals,
     )
     slopes = naive.gradients(work.predicted, scene.support_radius, 2, 1.0 / scale)
     linear = np.einsum("ijk,ijk->i", slopes, shift[:, None] - shift[None])
@@ -117,6 +119,23 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
     # Pairs that come within reach only by the displacement are not in the lists; they weigh little.
     np.testing.assert_allclose(work.targets + linear, after, atol=0.02)
     assert np.median(np.abs(work.targets + linear - after)) < 1e-3
+
+
+@pytest.mark.parametrize("ratio, dimension", [(2.0, 2), (2.0, 3), (2.6, 3)])
+def test_share_of_the_correction_is_that_which_the_stiffest_wave_bears(ratio, dimension):
+    """Against the largest eigenvalue of the operator on a block of disturbed lattice."""
+    side = {2: 24, 3: 9}[dimension]
+    points = np.array(list(np.ndindex((side,) * dimension)), float)
+    points += np.random.default_rng(0).uniform(-0.15, 0.15, points.shape)
+    points = np.pad(points, ((0, 0), (0, 3 - dimension)))
+    slopes = naive.gradients(points, ratio, 2, 1.0)
+    way = slopes.copy()  # of i, by the pressure of j: -g_ij; by its own: minus the sum of them
+    way[np.arange(len(points)), np.arange(len(points))] = slopes.sum(axis=1)
+    columns = way.transpose(0, 2, 1).reshape(-1, len(points))
+    operator = columns.T @ columns
+    scale = 1.0 / np.sqrt(operator.diagonal())
+    stiffest = np.linalg.eigvalsh(scale[:, None] * operator * scale)[-1]
+    assert 0.9 < stiffest * jacobi_share(ratio, 1.0, dimension) / (4.0 / 3.0) < 1.01
 
 
 def test_two_dimensions_stay_in_their_plane(solver):

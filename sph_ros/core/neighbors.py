@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, kernel, parallel_kernel
+from sph_ros.core.jit import bare, device, kernel, parallel_kernel
 from sph_ros.core.pair_sums import geometry_of_pairs
 from sph_ros.core.vector import LANES, append_within
 
@@ -124,26 +124,27 @@ def sort_by_cell(positions, grid, cell_of, order):
             written.
     """
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
-    cell_start = grid.cell_start
+    cell_start, count = grid.cell_start, positions.shape[0]
     cells = nx * ny * nz
-    for c in range(cells + 1):
+    for c in range(cells):
         cell_start[c] = 0
-    for i in range(positions.shape[0]):
+    for i in range(count):
         cx = cell_coordinate(positions[i, 0], grid.lower[0], grid.inverse_cell, nx)
         cy = cell_coordinate(positions[i, 1], grid.lower[1], grid.inverse_cell, ny)
         cz = cell_coordinate(positions[i, 2], grid.lower[2], grid.inverse_cell, nz)
         cell = (cz * ny + cy) * nx + cx
         cell_of[i] = cell
-        cell_start[cell + 1] += 1
-    for c in range(cells):
-        cell_start[c + 1] += cell_start[c]
-    for i in range(positions.shape[0]):
-        cell = cell_of[i]
-        order[cell_start[cell]] = i
         cell_start[cell] += 1
-    for c in range(cells, 0, -1):
-        cell_start[c] = cell_start[c - 1]
-    cell_start[0] = 0
+    # First the end of each cell, which then moves down to its start.
+    end = 0
+    for c in range(cells):
+        end += cell_start[c]
+        cell_start[c] = end
+    cell_start[cells] = count
+    for i in range(count - 1, -1, -1):
+        cell = cell_of[i]
+        cell_start[cell] -= 1
+        order[cell_start[cell]] = i
 
 
 @parallel_kernel
@@ -165,7 +166,7 @@ def transpose(positions, columns):
         columns[2, i] = positions[i, 2]
 
 
-@device
+@bare
 def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     """Append the neighbours of particle i; the new cursor, or -1 where there is no room."""
     xs, ys, zs = columns[0], columns[1], columns[2]
@@ -188,16 +189,16 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     return cursor
 
 
-@device
+@bare
 def fill_list(i, neighbors, start, cursor):
     """Fill the list that begins at `start` with i itself to a whole number of steps; the new end.
 
-    There is room: a search stops where fewer than `LANES` entries are left.
+    A whole step is written always, without a branch. There is room: a search stops where fewer than
+    `LANES` entries are left.
     """
-    while (cursor - start) % LIST_STEP != 0:
-        neighbors[cursor] = i
-        cursor += 1
-    return cursor
+    for k in range(LIST_STEP):
+        neighbors[cursor + k] = i
+    return start + (cursor - start + LIST_STEP - 1) // LIST_STEP * LIST_STEP
 
 
 @parallel_kernel

@@ -89,6 +89,7 @@ def density_targets(
     rest,
     time_step,
     targets,
+    residuals,
 ):
     """Densities about which the pressures' part may be taken as linear.
 
@@ -108,6 +109,8 @@ def density_targets(
         rest: share of what is above `MILD` [-], float32.
         time_step: [s], float32.
         targets: [-], (N,); written.
+        residuals: what of the density above 1 is to be taken back at the given displacements [-],
+            (N,); written.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
     for i in prange(targets.shape[0]):
@@ -119,7 +122,11 @@ def density_targets(
             t = contacts.terms[k]
             for axis in range(3):
                 excess -= time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
-        targets[i] = one + excess + density_scale * grown - linear
+        excess += density_scale * grown
+        targets[i] = one + excess - linear
+        for axis in range(3):
+            excess += contacts.gradients[i, axis] * displacements[i, axis]
+        residuals[i] = excess
 
 
 @parallel_kernel

@@ -21,7 +21,7 @@ from numba import prange
 
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
-from sph_ros.core.pair_sums import divergence_of_pairs, impulse_of_pairs, pack, push_by_pairs
+from sph_ros.core.pair_sums import impulse_of_pairs
 
 
 class Tension(NamedTuple):
@@ -99,109 +99,6 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
         displacements[i, 0] = -x - wall * g[i, 0] - wall_near * g[i, 3]
         displacements[i, 1] = -y - wall * g[i, 1] - wall_near * g[i, 4]
         displacements[i, 2] = -z - wall * g[i, 2] - wall_near * g[i, 5]
-
-
-@parallel_kernel
-def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
-    """How much a particle's own scaled pressure lowers its own density [1/m^2].
-
-    Args:
-        sums: from `sum_densities`.
-        contact_gradients: as in `cohesive_displacements`.
-        compliance: density per scaled pressure that the liquid itself yields [1/m^2], float32.
-        diagonal: (N,); written.
-    """
-    for i in prange(diagonal.shape[0]):
-        own = sums.gradient_square[i] + compliance
-        for axis in range(3):
-            total = sums.gradient[i, axis] + contact_gradients[i, axis]
-            own += total * total
-        diagonal[i] = max(own, compliance + np.float32(1e-12))
-
-
-@parallel_kernel
-def pressure_displacements(
-    pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
-):
-    """Displacements by the present pressures (Clavet 2005, Alg. 2, gathered).
-
-    Args:
-        pairs: from `sum_densities`.
-        pressures: times dt^2 / (rho0 virial) [m^2], (N,).
-        contact_gradients: as in `cohesive_displacements`.
-        cohesive: displacements to start from [m], (N, 3).
-        support_radius: h [m], float32.
-        displacements: [m], (N, 3); written.
-        packed: the same by `pack`, (N,) int64; written.
-    """
-    for i in prange(pressures.shape[0]):
-        own = pressures[i]
-        x, y, z = push_by_pairs(pairs, pressures, i)
-        x = cohesive[i, 0] - x - own * contact_gradients[i, 0]
-        y = cohesive[i, 1] - y - own * contact_gradients[i, 1]
-        z = cohesive[i, 2] - z - own * contact_gradients[i, 2]
-        displacements[i, 0], displacements[i, 1], displacements[i, 2] = x, y, z
-        packed[i] = pack(x, y, z, support_radius)
-
-
-@parallel_kernel
-def correct_pressures(
-    pairs,
-    densities,
-    contact_gradients,
-    support_radius,
-    displacements,
-    packed,
-    yielded,
-    diagonal,
-    compliance,
-    share,
-    momentum,
-    pressures,
-    guesses,
-    errors,
-):
-    """One iteration towards p = k (density - 1) >= 0 at the displaced positions.
-
-    A Jacobi correction, projected to pressures that push, then Nesterov's extrapolation (Beck &
-    Teboulle 2009): both sides of the equation are the gradient of a convex function.
-
-    Args:
-        pairs: from `sum_densities`.
-        densities: at the displacements zero, relative to rest [-], (N,).
-        contact_gradients: as in `cohesive_displacements`.
-        support_radius: h [m], float32.
-        displacements, packed: by the present guesses, from `pressure_displacements`.
-        yielded: how much the density sinks because free bodies give way to the guesses [-], (N,).
-        diagonal: from `pressure_diagonal`.
-        compliance: as in `pressure_diagonal`.
-        share: of the Jacobi correction that is taken [-], float32.
-        momentum: share of the last change that is added on top for the next guess [-], float32.
-        pressures: scaled [m^2], (N,); improved in place.
-        guesses: pressures extrapolated, (N,); those that `displacements` belong to, then the next.
-        errors: sum over each chunk of the density error left [-], (chunks,) float64; written.
-    """
-    count = pressures.shape[0]
-    for chunk in prange(errors.shape[0]):
-        error = 0.0
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            x, y, z = displacements[i, 0], displacements[i, 1], displacements[i, 2]
-            change = (
-                contact_gradients[i, 0] * x
-                + contact_gradients[i, 1] * y
-                + contact_gradients[i, 2] * z
-                - yielded[i]
-            )
-            change += divergence_of_pairs(pairs, displacements, packed, i, support_radius)
-            pressure = guesses[i]
-            residual = densities[i] - np.float32(1.0) + change - compliance * pressure
-            better = max(pressure + share * residual / diagonal[i], np.float32(0.0))
-            guesses[i] = max(better + momentum * (better - pressures[i]), np.float32(0.0))
-            pressures[i] = better
-            # Where there is no pressure a lack of density is a free surface, not an error.
-            if residual > np.float32(0.0) or pressure > np.float32(0.0):
-                error += abs(residual)
-        errors[chunk] = error
 
 
 @parallel_kernel

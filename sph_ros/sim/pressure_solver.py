@@ -5,10 +5,11 @@ import numpy as np
 
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
+from sph_ros.core import pressure as core
 from sph_ros.core import relaxation as relax
 from sph_ros.core.weights import DENSITY_POWER
 from sph_ros.sim.coupling import Coupling
-from sph_ros.sim.pressure import FIRST_SHARE, solve_pressures
+from sph_ros.sim.pressure import UNKNOWN, jacobi_share, solve_pressures
 from sph_ros.sim.scales import packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
 from sph_ros.sim.stress import Weights, virial_pressures, walls_share
@@ -31,7 +32,8 @@ class PressureSolver(Solver):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
         super().__init__(scene, solids, depth)
         self._packing = packing(scene, 0.0)
-        self._share = FIRST_SHARE
+        self._most_share = jacobi_share(scene.support_radius, scene.spacing, scene.dimension)
+        self._share = self._most_share
         self._coupling = None
 
     def set_material(self, material):
@@ -142,14 +144,14 @@ class PressureSolver(Solver):
         if len(self._solids.bodies):
             self._solids.bodies.take(self._work.reactions.sum(axis=0), centres)
 
-    def _iterate(self, densities, compliance, goal, time_step, displaced=False):
+    def _iterate(self, densities, compliance, goal, time_step, residuals=UNKNOWN):
         """Pressures from the guess in `scaled`, displacements and the solids' reactions.
 
         See `solve_pressures`. Free bodies must have had all pushes but this.
         """
         work = self._work
         gradients = work.contacts.gradients
-        relax.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
+        core.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
         if self._coupling is not None:
             self._coupling.add_diagonal(work.diagonal)
         self.iterations, self.density_error, self._share = solve_pressures(
@@ -160,8 +162,9 @@ class PressureSolver(Solver):
             compliance,
             goal,
             self._share,
+            self._most_share,
             self._coupling,
-            displaced,
+            residuals,
         )
         self._book_push(work.scaled, NO_TENSION, time_step)
 

@@ -245,7 +245,7 @@ def stable_time_step(scene, scales, drop, courant, ripples=math.inf):
         ripples: step that the shortest waves of surface tension bear [s].
 
     Returns:
-        The step, rounded down to a number people can read, and what bounds it.
+        The step, rounded down to two digits, and what bounds it.
     """
     h = scene.support_radius
     speed = expected_speed(scene, drop)
@@ -263,10 +263,6 @@ def stable_time_step(scene, scales, drop, courant, ripples=math.inf):
 
 
 def readable_step(step):
-    """The largest readable number not above `step`: 1, 1.25, ... 8 times a power of ten."""
-    exponent = math.floor(math.log10(step))
-    for mantissa in (8, 6.4, 5, 4, 3.2, 2.5, 2, 1.6, 1.25, 1):
-        value = mantissa * 10.0**exponent
-        if value <= step * (1 + 1e-9):
-            return round(value, 9 - exponent)
-    return 10.0**exponent
+    """The largest number of two digits not above `step`."""
+    unit = 10.0 ** (math.floor(math.log10(step)) - 1)
+    return round(math.floor(step / unit * (1 + 1e-9)) * unit, 12)

@@ -152,7 +152,8 @@ class Workspace:
         predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
         columns: coordinates for the neighbour search, (3, N + LANES) float32.
         cell_of, order: (N,) int32.
-        diagonal, scaled, guesses, targets, yielded: of the pressure iterations, (N,) float32.
+        diagonal, scaled, guesses, first, targets, residuals, yielded: of the pressure iterations,
+            (N,) float32.
         packed: displacements once more, (N,) int64.
         masses: of the particles where they differ [kg]; scales: times a factor, (N,) float32.
         errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
@@ -173,7 +174,9 @@ class Workspace:
         "diagonal": (0, np.float32),
         "scaled": (0, np.float32),
         "guesses": (0, np.float32),
+        "first": (0, np.float32),
         "targets": (0, np.float32),
+        "residuals": (0, np.float32),
         "yielded": (0, np.float32),
         "packed": (0, np.int64),
         "masses": (0, np.float32),
