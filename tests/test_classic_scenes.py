@@ -76,6 +76,23 @@ def test_rain_fills_its_container_and_settles():
     assert sim.positions[:, 2].max() + 0.5 * 0.0105 == pytest.approx(depth, rel=0.1)
 
 
+def test_where_rain_has_fallen_the_pool_is_calm():
+    """What iterations leave of the pressures' errors once made sound that never ended."""
+    scene = described("rain_2d", liquid=[{"box": {"min": [0, -1, 0], "max": [1, 1, 0.1]}}])
+    scene["emitters"][0]["from"] = 1000
+    sim = sph_ros.Simulation(scene)
+    sim.advance(2.0)
+    speeds, pushes = [], []
+    while sim.time < 2.5:
+        sim.step()
+        speeds.append(sim.statistics()["mean_speed"])
+        pushes.append(sim.wrench("container")[0][[0, 2]])
+    assert max(speeds) < 0.003
+    weight = sim.particle_count * 998.29 * 0.0105**2 * 9.81
+    assert np.std(pushes, axis=0).max() < 0.02 * weight
+    assert np.mean(pushes, axis=0) == pytest.approx([0.0, -weight], abs=0.01 * weight)
+
+
 def test_a_column_comes_over_the_wall_and_the_basin_holds_what_fits():
     """2 m^2 stay behind the wall of 1 m, 3 m^2 come over it and reach the house."""
     basin = described("dam_house_2d")

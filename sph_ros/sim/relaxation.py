@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relaxation solver: the order of a step."""
 
+import math
+
 import numpy as np
 
 from sph_ros.core import neighbors as search
@@ -12,6 +14,14 @@ from sph_ros.sim.scales import packing
 #: Pressure iterations end when the mean density error is below this share of the allowed
 #: compression. Looser, the errors keep a tank at rest in motion.
 TOLERANCE = 0.02
+
+#: The guess from the last step is late by one. What iterations leave of that error feeds sound; the
+#: implicit step damps sound by half of it at the same rate. So they leave no more than this share,
+SOUND_SHARE = 0.25
+
+#: unless it is below this share of the allowed compression, times the share of the liquid's depth
+#: that sound crosses in a step. With `TOLERANCE` alone a deep tank in short steps rings for ever.
+SOUND_TOLERANCE = 0.025
 
 #: Share of the support radius that the fastest expected particle crosses in a step.
 COURANT = 0.4
@@ -127,10 +137,18 @@ class RelaxationSolver(PressureSolver):
         self._push_bodies()
         compliance = np.float32(1.0 / (self.scales.stiffness * unit))
         np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
-        goal = Goal(TOLERANCE * self._material.compression)
-        self._iterate(work.sums.density, compliance, goal, time_step)
+        self._iterate(work.sums.density, compliance, self._goal(time_step), time_step)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         self._push_bodies()
+
+    def _goal(self, time_step):
+        """When the pressure iterations end."""
+        least = most = TOLERANCE
+        if self._depth > 0.0:
+            sound = math.sqrt(self.scales.stiffness / self.scales.rest_density)
+            least = min(most, SOUND_TOLERANCE * sound * time_step / self._depth)
+        compression = self._material.compression
+        return Goal(least * compression, SOUND_SHARE, most * compression)
 
     def _finish(self, fluid, time_step):
         """Relaxed positions outside all solids, and the velocities that follow from them."""
