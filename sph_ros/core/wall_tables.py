@@ -24,6 +24,7 @@ covers the distances -h ... h in equal steps; beyond h a wall adds nothing, deep
 is `full_cover`.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -91,19 +92,24 @@ def flat_wall(distance, support_radius, spacing, dimension, mirrored, weights=PO
         weights: of the two columns.
     """
     distance = np.asarray(distance, dtype=float)
+    settings = (support_radius, spacing, dimension, mirrored)
+    curves = [_flat_curve(weight, *settings) for weight in weights]
+    return np.stack([np.interp(distance, *curve, right=0.0) for curve in curves], axis=-1)
+
+
+@functools.lru_cache(maxsize=32)  # in 2D a quarter of a second, and a scene asks ten times
+def _flat_curve(weight, support_radius, spacing, dimension, mirrored):
+    """Distances [m] and the shares there that `flat_wall` takes its values from, (F,) each."""
+    settings = (support_radius, spacing, dimension)
     fine = np.linspace(-support_radius, support_radius, 8 * TABLE_STEPS + 1)
     layers = np.arange(int(math.ceil(4.0 * support_radius / spacing)) + 1)
     covered = fine[:, None] + (layers + 0.5) * spacing
     height = 2.0 * fine[:, None] + layers * spacing if mirrored else covered
-    columns = []
-    for weight in weights:
-        full = lattice_sum(weight, support_radius, spacing, dimension)
-        terms = layer_weight(weight, height, support_radius, spacing, dimension)
-        share = np.maximum.accumulate(terms.sum(axis=1)[::-1])[::-1] / full
-        deepest = layer_weight(weight, covered[0], support_radius, spacing, dimension).sum() / full
-        share = np.minimum(share, deepest)
-        columns.append(np.interp(distance, fine, share, right=0.0))
-    return np.stack(columns, axis=-1)
+    full = lattice_sum(weight, *settings)
+    terms = layer_weight(weight, height, *settings)
+    share = np.maximum.accumulate(terms.sum(axis=1)[::-1])[::-1] / full
+    deepest = layer_weight(weight, covered[0], *settings).sum() / full
+    return fine, np.minimum(share, deepest)
 
 
 def flat_wall_laplacian(share, support_radius, spacing, dimension):
