@@ -157,6 +157,32 @@ def test_oil_that_starts_beside_water_ends_on_top_of_it():
     assert sim.statistics()["lost_particles"] == 0
 
 
+def test_families_of_lennard_jones_particles_separate_and_the_light_one_rises():
+    scene = described("lennard_jones")
+    scene["liquid"][0]["box"]["max"][0] = scene["solids"][0]["container"]["box"]["max"][0] = 0.03
+    sim = sph_ros.Simulation(scene)
+    oil = sim.families == 1
+    assert oil.sum() == 200 == (~oil).sum()
+
+    def unlike():
+        """Share of neighbours that are of two families."""
+        near = cKDTree(sim.positions).query_pairs(1.4 * sim.scene.spacing, output_type="ndarray")
+        return (oil[near[:, 0]] != oil[near[:, 1]]).mean()
+
+    assert unlike() == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_allclose(sim.velocities.mean(axis=0), 0.0, atol=1e-6)
+    np.testing.assert_allclose(sim.velocities.std(axis=0), [0.19, 0.0, 0.19], rtol=0.1)
+    sim.advance(0.25)
+    shares, lifts = [], []
+    while sim.time < 0.35:
+        sim.advance(0.01)
+        shares.append(unlike())
+        lifts.append(sim.positions[oil, 2].mean() - sim.positions[~oil, 2].mean())
+    assert np.mean(shares) < 0.3
+    assert np.mean(lifts) > 0.0015
+    assert sim.statistics()["lost_particles"] == 0
+
+
 def test_honey_coils():
     """Just above the plate the thread goes round and round, one way."""
     scene = described("honey_spoon", spacing=0.002)

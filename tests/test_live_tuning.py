@@ -54,7 +54,7 @@ def tuner():
         yield Tuner(ros)
 
 
-@pytest.mark.parametrize("scene", [name for name in list_scenes() if not name.endswith("_large")])
+@pytest.mark.parametrize("scene", list_scenes())
 def test_density_follows_its_parameter(tuner, scene):
     tuner.set("scene", scene)
     tuner.step()  # the cloud that answers may be of the scene before
@@ -65,12 +65,13 @@ def test_density_follows_its_parameter(tuner, scene):
     tuner.set("material.density", 0.5 * density)
     for _ in range(4):  # a cloud of before may still be on its way
         after = tuner.step()
-        common = sorted(before.keys() & after.keys())
-        first = common[: max(len(before) // 3, 1)]  # of the first liquid
-        ratio = np.median([after[k] / before[k] for k in first])
-        if ratio < 0.75:
+        ratios = np.array([after[k] / before[k] for k in before.keys() & after.keys()])
+        halved = ratios[ratios < 0.75]
+        # Other liquids in the scene, half of the particles at most, keep theirs.
+        if len(halved) > 0.45 * len(ratios):
             break
-    assert ratio == pytest.approx(0.5, rel=0.1)
+    assert len(halved) > 0.45 * len(ratios)
+    assert np.median(halved) == pytest.approx(0.5, rel=0.1)
     for name in ("viscosity", "surface_tension", "elasticity"):
         tuner.set(f"material.{name}", 0.5 * tuner.number(f"material.{name}"))
     assert tuner.step()

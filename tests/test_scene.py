@@ -80,6 +80,7 @@ EXPECTED_PARTICLES = {
     "fountain": (0, 0),
     "honey_spoon": (300, 600),  # what stays in the spoon
     "jelly": (1900, 2200),
+    "lennard_jones": (800, 800),
     "oil_water": (4500, 4500),
     "pour_glass": (0, 0),  # all of it is poured
     "rain_2d": (0, 0),  # all of it rains

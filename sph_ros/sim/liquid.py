@@ -47,7 +47,9 @@ def fill_blocks(scene):
         velocity = np.array(block.velocity)
         if scene.dimension == 2:
             velocity[1] = 0.0
-        velocities = np.concatenate([velocities, np.broadcast_to(velocity, points.shape)])
+        velocities = np.concatenate(
+            [velocities, velocity + _agitation(block, points, scene, index)]
+        )
         counts.append(len(points))
     blocks = np.repeat(np.arange(len(counts)), np.array(counts, int))
     return np.ascontiguousarray(positions, np.float32), velocities.astype(np.float32), blocks
@@ -55,7 +57,12 @@ def fill_blocks(scene):
 
 def families(scene, blocks):
     """Index into `scene.liquids` of particles by the block they are of, (N,) uint8."""
-    return np.array(scene.families, np.uint8)[blocks]
+    found = np.array(scene.families, np.uint8)[blocks]
+    for index, block in enumerate(scene.liquid):
+        if block.share < 1.0:
+            mixed = np.random.default_rng(index).permutation(np.flatnonzero(blocks == index))
+            found[mixed[round(block.share * len(mixed)) :]] = 0
+    return found
 
 
 class Families:
@@ -163,6 +170,16 @@ def _is_new(points, earlier, scene, index):
         distance, _ = cKDTree(earlier).query(points, distance_upper_bound=scene.spacing)
         new &= distance > _NEAREST * scene.spacing
     return new
+
+
+def _agitation(block, points, scene, index):
+    """Random velocities of a block's particles, their mean zero [m/s], (N, 3)."""
+    if block.agitation == 0.0 or not len(points):
+        return np.zeros(points.shape)
+    velocities = np.random.default_rng(index).normal(0.0, block.agitation, points.shape)
+    if scene.dimension == 2:
+        velocities[:, 1] = 0.0
+    return velocities - velocities.mean(axis=0)
 
 
 def _to_scene(points, pose):

@@ -228,6 +228,8 @@ def expected_speed(scene, drop):
     # Blocks may be sent at each other.
     velocities = [(0.0, 0.0, 0.0), *(block.velocity for block in scene.liquid)]
     initial = max(math.dist(a, b) for a in velocities for b in velocities)
+    # Of a random velocity next to nothing is beyond three times its RMS.
+    initial += max((3.0 * block.agitation for block in scene.liquid), default=0.0)
     jets = [make_jet(emitter, scene).speed for emitter in scene.emitters]
     initial = max(initial, max(jets, default=0.0))
     return max(math.sqrt(2 * g * drop) + initial, LEAST_SPEED)

@@ -58,15 +58,21 @@ class LiquidBlock:
         shape: what is filled; its own frame.
         pose: of the shape's frame in the scene's frame.
         velocity: of every particle [m/s], scene's frame.
+        agitation: RMS of a random velocity along each axis, added to every particle's [m/s]; the
+            same at every start.
         material: of this piece; None: the scene's.
         color: red, green, blue, 0 to 1; None: the material's.
+        share: of its particles that are of that material; the others, strewn among them, are of the
+            scene's: a mixture.
     """
 
     shape: Shape
     pose: Pose = Pose()
     velocity: Vector = quantity("m/s", (0.0, 0.0, 0.0), low=-100.0, high=100.0)
+    agitation: float = quantity("m/s", 0.0, low=0.0, high=100.0)
     material: Material | None = None
     color: Vector | None = quantity("1", None, low=0.0, high=1.0)
+    share: float = quantity("1", 1.0, low=0.0, high=1.0)
 
     def __post_init__(self):
         """Refuse shapes that hold no definite amount of liquid."""
