@@ -19,6 +19,9 @@ from sph_ros.core.vector import LANES, append_within
 #: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
 CHUNK = 256
 
+#: Coordinates of sixteen particles.
+BLOCK = 48
+
 #: Lists have a multiple of so many entries.
 LIST_STEP = 8
 
@@ -99,16 +102,35 @@ def bounding_box(positions, lower, upper):
     Returns:
         The first row that is not finite, or -1.
     """
-    for axis in range(3):
-        lower[axis] = np.inf
-        upper[axis] = -np.inf
+    values = positions.reshape(positions.size)
+    # Blocks of sixteen rows, so that the compiler makes vectors of it; 0 times a value is 0 unless
+    # it is not finite.
+    least, most = np.full(BLOCK, np.float32(np.inf)), np.full(BLOCK, np.float32(-np.inf))
+    zeros = np.zeros(BLOCK, np.float32)
+    whole = values.size // BLOCK * BLOCK
+    for first in range(0, whole, BLOCK):
+        block = values[first : first + BLOCK]
+        for k in range(BLOCK):
+            value = block[k]
+            least[k] = value if value < least[k] else least[k]
+            most[k] = value if value > most[k] else most[k]
+            zeros[k] += np.float32(0.0) * value
+    for k in range(whole, values.size):
+        value, place = values[k], k - whole
+        least[place] = min(least[place], value)
+        most[place] = max(most[place], value)
+        zeros[place] += np.float32(0.0) * value
+    lower[:], upper[:] = np.inf, -np.inf
+    total = np.float32(0.0)
+    for k in range(BLOCK):
+        lower[k % 3] = min(lower[k % 3], least[k])
+        upper[k % 3] = max(upper[k % 3], most[k])
+        total += zeros[k]
+    if total == np.float32(0.0):
+        return -1
     for i in range(positions.shape[0]):
-        for axis in range(3):
-            value = positions[i, axis]
-            if not np.isfinite(value):
-                return i
-            lower[axis] = min(lower[axis], value)
-            upper[axis] = max(upper[axis], value)
+        if not np.isfinite(positions[i]).all():
+            return i
     return -1
 
 

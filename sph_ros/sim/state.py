@@ -103,7 +103,7 @@ class Fluid:
     def reorder(self, order):
         """Let row k be what was row order[k], in all arrays but positions and velocities."""
         for rows in (self.pressures, self.clearance, self.particle, *self.extras.values()):
-            rows[:] = rows[order]
+            rows[:] = rows.take(order, axis=0, mode="clip")  # the fastest of numpy's ways
 
     def add(self, positions, velocities, ids):
         """Append particles whose ids are higher than all others; other rows of theirs are 0."""
