@@ -281,7 +281,6 @@ def sum_densities(
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
     count = pairs.start.shape[0]
-    # By chunks, in order: a list may spoil the beginning of the one behind it.
     for chunk in prange(chunks):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h)

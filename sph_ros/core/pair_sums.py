@@ -14,24 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from sph_ros.core.jit import inlined
-from sph_ros.core.vector import (
-    FAST,
-    FLOATS,
-    HAS_GATHER,
-    INTS,
-    constant,
-    data_pointer,
-    gather,
-    gather_words,
-    lane_sum,
-    load,
-    multiply_add,
-    positive,
-    splat,
-    square_root,
-    store,
-    vector_loop,
-)
+from sph_ros.core.vector import FAST, HAS_GATHER, data_pointer, sums_in_vectors
 
 #: Numbers in a packed displacement are whole multiples of `REACH` support radii / 2^20.
 REACH = np.float32(4.0)
@@ -73,15 +56,15 @@ def unpacked(word):
     return np.float32((word << 32) >> 43), np.float32(word >> 43), np.float32(z)
 
 
-def _unpacked(builder, source, indices, mask):
+def _unpacked(builder, v, source, indices):
     """Components of the packed displacements source[indices], vectors of floats, in their unit."""
-    low, high = gather_words(builder, source, indices, mask)
-    eleven, bits = constant(11, INTS), constant(0x7FF, INTS)
+    low, high = v.gather_words(source, indices)
+    eleven, bits = v.constant(11, integer=True), v.constant(0x7FF, integer=True)
     z_low = builder.and_(low, bits)
     z_high = builder.shl(builder.and_(high, bits), eleven)
-    z = builder.sub(builder.or_(z_low, z_high), constant(1 << 20, INTS))
+    z = builder.sub(builder.or_(z_low, z_high), v.constant(1 << 20, integer=True))
     whole = builder.ashr(low, eleven), builder.ashr(high, eleven), z
-    return [builder.sitofp(number, FLOATS) for number in whole]
+    return [builder.sitofp(number, v.floats) for number in whole]
 
 
 # ---------------------------------------------------------------- pushes
@@ -98,19 +81,17 @@ def _push_in_vectors(typingctx, neighbors, gradients, values, start, end, own):
         js = data_pointer(context, builder, sig.args[0], neighbors_)
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(3)]
         source = data_pointer(context, builder, sig.args[2], values_)
-        centre = splat(builder, own_)
 
-        def body(k, mask, sums):
-            theirs = gather(builder, source, load(builder, js, k, mask, INTS), mask)
-            both = builder.fadd(centre, theirs, flags=FAST)
+        def body(v, k, sums):
+            theirs = v.gather(source, v.load(js, k, integer=True))
+            both = builder.fadd(v.splat(own_), theirs, flags=FAST)
             return [
-                multiply_add(builder, both, load(builder, row, k, mask), value)
+                v.multiply_add(both, v.load(row, k), value)
                 for row, value in zip(rows, sums, strict=True)
             ]
 
-        sums = vector_loop(builder, start_, end_, 3, body)
-        total = [lane_sum(builder, value) for value in sums]
-        return context.make_tuple(builder, sig.return_type, total)
+        sums = sums_in_vectors(builder, start_, end_, 3, body)
+        return context.make_tuple(builder, sig.return_type, sums)
 
     return signature, codegen
 
@@ -156,17 +137,16 @@ def _divergence_in_vectors(typingctx, neighbors, gradients, packed, start, end, 
         js = data_pointer(context, builder, sig.args[0], neighbors_)
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(3)]
         source = data_pointer(context, builder, sig.args[2], packed_)
-        centre = [splat(builder, value) for value in (x_, y_, z_)]
 
-        def body(k, mask, sums):
-            theirs = _unpacked(builder, source, load(builder, js, k, mask, INTS), mask)
+        def body(v, k, sums):
+            theirs = _unpacked(builder, v, source, v.load(js, k, integer=True))
             total = sums[0]
-            for row, own, other in zip(rows, centre, theirs, strict=True):
-                way = builder.fsub(own, other, flags=FAST)
-                total = multiply_add(builder, load(builder, row, k, mask), way, total)
+            for row, own, other in zip(rows, (x_, y_, z_), theirs, strict=True):
+                way = builder.fsub(v.splat(own), other, flags=FAST)
+                total = v.multiply_add(v.load(row, k), way, total)
             return [total]
 
-        return lane_sum(builder, vector_loop(builder, start_, end_, 1, body)[0])
+        return sums_in_vectors(builder, start_, end_, 1, body)[0]
 
     return signature, codegen
 
@@ -229,34 +209,33 @@ def _impulse_in_vectors(typingctx, neighbors, gradients, velocities, start, end,
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
         source = data_pointer(context, builder, sig.args[2], velocities_)
         sources = [builder.gep(source, [ir.Constant(start_.type, axis)]) for axis in range(3)]
-        centre = [splat(builder, builder.extract_value(own_, axis)) for axis in range(3)]
-        linear, quadratic, most = (
-            splat(builder, builder.extract_value(rates_, which)) for which in range(3)
-        )
-        one, columns = constant(1.0), constant(3, INTS)
+        centre = [builder.extract_value(own_, axis) for axis in range(3)]
+        rates_ = [builder.extract_value(rates_, which) for which in range(3)]
 
-        def body(k, mask, sums):
-            indices = builder.mul(load(builder, js, k, mask, INTS), columns)
-            gradient = [load(builder, row, k, mask) for row in rows[:3]]
-            u = load(builder, rows[3], k, mask)
-            along = constant(0.0)
+        def body(v, k, sums):
+            linear, quadratic, most = (v.splat(rate) for rate in rates_)
+            columns = v.constant(3, integer=True)
+            indices = builder.mul(v.load(js, k, integer=True), columns)
+            gradient = [v.load(row, k) for row in rows[:3]]
+            u = v.load(rows[3], k)
+            along = v.constant(0.0)
             for slope, velocity, there in zip(gradient, centre, sources, strict=True):
-                relative = builder.fsub(velocity, gather(builder, there, indices, mask), flags=FAST)
-                along = multiply_add(builder, relative, slope, along)
-            inverse_u = builder.fdiv(one, builder.fadd(u, constant(1e-3), flags=FAST))
-            approach = builder.fmul(positive(builder, along, mask), inverse_u, flags=FAST)
-            wanted = multiply_add(builder, quadratic, approach, linear)
+                relative = builder.fsub(v.splat(velocity), v.gather(there, indices), flags=FAST)
+                along = v.multiply_add(relative, slope, along)
+            shifted = builder.fadd(u, v.constant(1e-3), flags=FAST)
+            inverse_u = builder.fdiv(v.constant(1.0), shifted)
+            approach = builder.fmul(v.positive(along), inverse_u, flags=FAST)
+            wanted = v.multiply_add(quadratic, approach, linear)
             taken = builder.select(builder.fcmp_ordered("<", wanted, most), wanted, most)
             share = builder.fmul(builder.fmul(u, taken, flags=FAST), along, flags=FAST)
             share = builder.fmul(builder.fmul(share, inverse_u, flags=FAST), inverse_u, flags=FAST)
             return [
-                multiply_add(builder, share, slope, value)
+                v.multiply_add(share, slope, value)
                 for slope, value in zip(gradient, sums, strict=True)
             ]
 
-        sums = vector_loop(builder, start_, end_, 3, body)
-        total = [lane_sum(builder, value) for value in sums]
-        return context.make_tuple(builder, sig.return_type, total)
+        sums = sums_in_vectors(builder, start_, end_, 3, body)
+        return context.make_tuple(builder, sig.return_type, sums)
 
     return signature, codegen
 
@@ -344,35 +323,33 @@ def _growth_in_vectors(
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
         places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
         source = data_pointer(context, builder, sig.args[3], packed_)
-        centre = [splat(builder, builder.extract_value(at_, axis)) for axis in range(3)]
-        own_way = [splat(builder, builder.extract_value(way_, axis)) for axis in range(3)]
-        unit_, inverse_ = splat(builder, unit_), splat(builder, inverse_)
+        centre = [builder.extract_value(at_, axis) for axis in range(3)]
+        own_way = [builder.extract_value(way_, axis) for axis in range(3)]
 
-        def body(k, mask, sums):
+        def body(v, k, sums):
             grown, linear = sums
-            indices = load(builder, js, k, mask, INTS)
+            indices = v.load(js, k, integer=True)
             square = None
-            theirs = _unpacked(builder, source, indices, mask)
+            theirs = _unpacked(builder, v, source, indices)
             for axis, other in enumerate(theirs):
-                relative = builder.fsub(own_way[axis], other, flags=FAST)
-                relative = builder.fmul(relative, unit_, flags=FAST)
-                linear = multiply_add(builder, load(builder, rows[axis], k, mask), relative, linear)
-                there = gather(builder, places[axis], indices, mask)
+                relative = builder.fsub(v.splat(own_way[axis]), other, flags=FAST)
+                relative = builder.fmul(relative, v.splat(unit_), flags=FAST)
+                linear = v.multiply_add(v.load(rows[axis], k), relative, linear)
+                there = v.gather(places[axis], indices)
                 apart = builder.fadd(
-                    builder.fsub(centre[axis], there, flags=FAST), relative, flags=FAST
+                    builder.fsub(v.splat(centre[axis]), there, flags=FAST), relative, flags=FAST
                 )
                 term = builder.fmul(apart, apart, flags=FAST)
                 square = term if square is None else builder.fadd(square, term, flags=FAST)
-            share = builder.fmul(square_root(builder, square), inverse_, flags=FAST)
-            u = positive(builder, builder.fsub(constant(1.0), share, flags=FAST), mask)
-            before = load(builder, rows[3], k, mask)
-            grown = multiply_add(builder, u, u, grown)
+            share = builder.fmul(v.square_root(square), v.splat(inverse_), flags=FAST)
+            u = v.positive(builder.fsub(v.constant(1.0), share, flags=FAST))
+            before = v.load(rows[3], k)
+            grown = v.multiply_add(u, u, grown)
             grown = builder.fsub(grown, builder.fmul(before, before, flags=FAST), flags=FAST)
             return [grown, linear]
 
-        sums = vector_loop(builder, start_, end_, 2, body)
-        total = [lane_sum(builder, value) for value in sums]
-        return context.make_tuple(builder, sig.return_type, total)
+        sums = sums_in_vectors(builder, start_, end_, 2, body)
+        return context.make_tuple(builder, sig.return_type, sums)
 
     return signature, codegen
 
@@ -458,34 +435,33 @@ def _geometry_in_vectors(
         js = data_pointer(context, builder, sig.args[0], neighbors_)
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
         places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
-        centre = [splat(builder, builder.extract_value(at_, axis)) for axis in range(3)]
-        slope_, inverse_ = splat(builder, slope_), splat(builder, inverse_)
-        one, tiny = constant(1.0), constant(TINY)
+        centre = [builder.extract_value(at_, axis) for axis in range(3)]
 
-        def body(k, mask, sums):
-            indices = load(builder, js, k, mask, INTS)
-            square, apart = tiny, []
+        def body(v, k, sums):
+            indices = v.load(js, k, integer=True)
+            square, apart = v.constant(TINY), []
             for place, own in zip(places, centre, strict=True):
-                apart.append(builder.fsub(own, gather(builder, place, indices, mask), flags=FAST))
-                square = multiply_add(builder, apart[-1], apart[-1], square)
-            inverse_r = builder.fdiv(one, square_root(builder, square))
-            share = builder.fmul(builder.fmul(square, inverse_r, flags=FAST), inverse_, flags=FAST)
-            u = builder.select(mask, builder.fsub(one, share, flags=FAST), constant(0.0))
-            length = builder.fmul(slope_, u, flags=FAST)
+                there = v.gather(place, indices)
+                apart.append(builder.fsub(v.splat(own), there, flags=FAST))
+                square = v.multiply_add(apart[-1], apart[-1], square)
+            inverse_r = builder.fdiv(v.constant(1.0), v.square_root(square))
+            share = builder.fmul(square, inverse_r, flags=FAST)
+            share = builder.fmul(share, v.splat(inverse_), flags=FAST)
+            u = builder.fsub(v.constant(1.0), share, flags=FAST)
+            length = builder.fmul(v.splat(slope_), u, flags=FAST)
             factor = builder.fmul(length, inverse_r, flags=FAST)
             u2 = builder.fmul(u, u, flags=FAST)
-            new = [builder.fadd(sums[0], u2, flags=FAST), multiply_add(builder, u2, u, sums[1])]
-            new.append(multiply_add(builder, length, length, sums[2]))
-            store(builder, u, rows[3], k)
+            new = [builder.fadd(sums[0], u2, flags=FAST), v.multiply_add(u2, u, sums[1])]
+            new.append(v.multiply_add(length, length, sums[2]))
+            v.store(u, rows[3], k)
             for axis in range(3):
                 component = builder.fmul(factor, apart[axis], flags=FAST)
-                store(builder, component, rows[axis], k)
+                v.store(component, rows[axis], k)
                 new.append(builder.fadd(sums[3 + axis], component, flags=FAST))
             return new
 
-        sums = vector_loop(builder, start_, end_, 6, body)
-        total = [lane_sum(builder, value) for value in sums]
-        return context.make_tuple(builder, sig.return_type, total)
+        sums = sums_in_vectors(builder, start_, end_, 6, body)
+        return context.make_tuple(builder, sig.return_type, sums)
 
     return signature, codegen
 
@@ -555,8 +531,7 @@ def geometry_of_pairs(pairs, columns, i, slope, inverse_h):
     """Gradients of the pairs of particle i, and sums over them.
 
     Args:
-        pairs: from `find_neighbors`; the gradients of i's pairs are written, and sometimes those of
-            the pairs after them, which must not have been written yet.
+        pairs: from `find_neighbors`; the gradients of i's pairs are written.
         columns: as in `find_neighbors`.
         i: row of the particle.
         slope: derivative of the normalised density weight at r = 0 [1/m], float32.

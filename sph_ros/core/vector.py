@@ -19,32 +19,125 @@ LANES = 16
 #: Numba is told to interpret: the vector code becomes a plain loop.
 INTERPRETED = bool(config.DISABLE_JIT)
 
-FLOATS = ir.VectorType(ir.FloatType(), LANES)
-INTS = ir.VectorType(ir.IntType(32), LANES)
-_BITS = ir.VectorType(ir.IntType(1), LANES)
-_HALF = ir.VectorType(ir.IntType(32), LANES // 2)
-_BYTES = ir.IntType(8).as_pointer()
-
 HAS_COMPRESSING_STORE = bool(llvm.get_host_cpu_features().get("avx512f", False))
 
-#: Whether sixteen values can be read from sixteen places by one instruction.
-HAS_GATHER = HAS_COMPRESSING_STORE and not INTERPRETED
+#: Whether several values can be read from as many places by one instruction.
+HAS_GATHER = (
+    HAS_COMPRESSING_STORE
+    and bool(llvm.get_host_cpu_features().get("avx512vl", False))
+    and not INTERPRETED
+)
 
 #: The same freedom as all other code has: see `core.jit`.
 FAST = ("reassoc", "contract", "nsz")
 
-
-def splat(builder, value, vector_type=FLOATS):
-    """A vector with `value` in every lane."""
-    empty = ir.Constant(vector_type, ir.Undefined)
-    first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(INTS, [0] * LANES)
-    return builder.shuffle_vector(first, empty, zeros)
+_INT32, _FLOAT = ir.IntType(32), ir.FloatType()
+_BYTES = ir.IntType(8).as_pointer()
 
 
-def constant(value, vector_type=FLOATS):
-    """A vector with the number `value` in every lane."""
-    return ir.Constant(vector_type, [value] * vector_type.count)
+class Vectors:
+    """Makes instructions on vectors of some width; gathering needs `HAS_GATHER`.
+
+    Args:
+        builder: of the function.
+        lanes: 8 or 16.
+
+    Attributes:
+        floats, ints: types of the vectors.
+    """
+
+    def __init__(self, builder, lanes):
+        self._builder, self.lanes = builder, lanes
+        self.floats, self.ints = (ir.VectorType(kind, lanes) for kind in (_FLOAT, _INT32))
+
+    def constant(self, value, integer=False):
+        """A vector with the number `value` in every lane."""
+        return ir.Constant(self.ints if integer else self.floats, [value] * self.lanes)
+
+    def splat(self, value):
+        """A vector with `value` in every lane."""
+        vector_type = ir.VectorType(value.type, self.lanes)
+        empty = ir.Constant(vector_type, ir.Undefined)
+        first = self._builder.insert_element(empty, value, ir.Constant(_INT32, 0))
+        return self._builder.shuffle_vector(first, empty, self.constant(0, integer=True))
+
+    def load(self, pointer, index, integer=False):
+        """The vector that begins at pointer[index]."""
+        kind = self.ints if integer else self.floats
+        place = self._builder.gep(pointer, [index])
+        vector = self._builder.load(self._builder.bitcast(place, kind.as_pointer()), typ=kind)
+        vector.align = 4
+        return vector
+
+    def store(self, vector, pointer, index):
+        """Write a vector to where pointer[index] is."""
+        place = self._builder.gep(pointer, [index])
+        self._builder.store(
+            vector, self._builder.bitcast(place, vector.type.as_pointer())
+        ).align = 4
+
+    def gather(self, pointer, indices):
+        """Elements pointer[indices] of 4 bytes, as floats."""
+        name = {8: "avx512.mask.gather3siv8.sf", 16: "avx512.mask.gather.dps.512"}[self.lanes]
+        return self._gather(name, self.floats, pointer, indices, 4)
+
+    def gather_words(self, pointer, indices):
+        """Elements pointer[indices] of 8 bytes as two vectors, lower and upper half of each."""
+        words, builder = ir.VectorType(ir.IntType(64), 8), self._builder
+        pair = ir.VectorType(_INT32, 16)
+        pieces = []
+        for first in range(0, self.lanes, 8):
+            lanes = ir.Constant(ir.VectorType(_INT32, 8), list(range(first, first + 8)))
+            part = builder.shuffle_vector(indices, ir.Constant(self.ints, ir.Undefined), lanes)
+            found = self._gather("avx512.mask.gather.dpq.512", words, pointer, part, 8)
+            pieces.append(builder.bitcast(found, pair))
+        pieces.append(ir.Constant(pair, ir.Undefined))
+        return [
+            builder.shuffle_vector(
+                *pieces[:2], ir.Constant(self.ints, list(range(which, 2 * self.lanes, 2)))
+            )
+            for which in (0, 1)
+        ]
+
+    def _gather(self, name, kind, pointer, indices, size):
+        bits = ir.VectorType(ir.IntType(1), kind.count)
+        arguments = [kind, _BYTES, indices.type, bits, _INT32]
+        function = cgutils.get_or_insert_function(
+            self._builder.module, ir.FunctionType(kind, arguments), f"llvm.x86.{name}"
+        )
+        nothing, everything = ir.Constant(kind, None), ir.Constant(bits, [1] * kind.count)
+        place = self._builder.bitcast(pointer, _BYTES)
+        return self._builder.call(
+            function, [nothing, place, indices, everything, ir.Constant(_INT32, size)]
+        )
+
+    def multiply_add(self, a, b, c):
+        """A b + c, fused where the processor can."""
+        return self._builder.fadd(self._builder.fmul(a, b, flags=FAST), c, flags=FAST)
+
+    def square_root(self, vector):
+        """Square roots of a vector of floats."""
+        function = cgutils.get_or_insert_function(
+            self._builder.module,
+            ir.FunctionType(self.floats, [self.floats]),
+            f"llvm.sqrt.v{self.lanes}f32",
+        )
+        return self._builder.call(function, [vector])
+
+    def positive(self, vector):
+        """The floats of a vector, 0 instead of those that are less."""
+        zero = self.constant(0.0)
+        above = self._builder.fcmp_ordered(">", vector, zero)
+        return self._builder.select(above, vector, zero)
+
+    def sum(self, vector):
+        """Sum over the lanes of a vector of floats."""
+        function = cgutils.get_or_insert_function(
+            self._builder.module,
+            ir.FunctionType(_FLOAT, [_FLOAT, self.floats]),
+            f"llvm.vector.reduce.fadd.v{self.lanes}f32",
+        )
+        return self._builder.call(function, [ir.Constant(_FLOAT, -0.0), vector], fastmath=FAST)
 
 
 def data_pointer(context, builder, array_type, array, row=None):
@@ -56,124 +149,69 @@ def data_pointer(context, builder, array_type, array, row=None):
     return builder.gep(view.data, [builder.mul(length, ir.Constant(length.type, row))])
 
 
-def load(builder, pointer, index, mask=None, vector_type=FLOATS):
-    """The vector that begins at pointer[index], 0 where not `mask`; all 16 elements are read."""
-    place = builder.gep(pointer, [index])
-    vector = builder.load(builder.bitcast(place, vector_type.as_pointer()), typ=vector_type)
-    vector.align = 4
-    return vector if mask is None else builder.select(mask, vector, ir.Constant(vector_type, None))
+def sums_in_vectors(builder, start, end, count, body):
+    """Sums of `count` terms over start, start + 1, ... end - 1, a multiple of 8 indices.
 
-
-def store(builder, vector, pointer, index):
-    """Write a vector to where pointer[index] is."""
-    place = builder.gep(pointer, [index])
-    builder.store(vector, builder.bitcast(place, vector.type.as_pointer())).align = 4
-
-
-def gather(builder, pointer, indices, mask):
-    """Elements pointer[indices] of 4 bytes, as floats, 0 where not `mask`; needs `HAS_GATHER`."""
-    arguments = [FLOATS, _BYTES, INTS, _BITS, ir.IntType(32)]
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(FLOATS, arguments), "llvm.x86.avx512.mask.gather.dps.512"
-    )
-    place = builder.bitcast(pointer, _BYTES)
-    size = ir.Constant(ir.IntType(32), 4)
-    return builder.call(function, [constant(0.0), place, indices, mask, size])
-
-
-def gather_words(builder, pointer, indices, mask):
-    """Elements pointer[indices] of 8 bytes as two vectors, lower and upper half of each."""
-    words, bits = (ir.VectorType(ir.IntType(size), LANES // 2) for size in (64, 1))
-    arguments = [words, _BYTES, _HALF, bits, ir.IntType(32)]
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(words, arguments), "llvm.x86.avx512.mask.gather.dpq.512"
-    )
-    place = builder.bitcast(pointer, _BYTES)
-    size = ir.Constant(ir.IntType(32), 8)
-    pieces = []
-    for first in (0, LANES // 2):
-        lanes = ir.Constant(_HALF, list(range(first, first + LANES // 2)))
-        half = builder.shuffle_vector(indices, ir.Constant(INTS, ir.Undefined), lanes)
-        allowed = builder.shuffle_vector(mask, ir.Constant(_BITS, ir.Undefined), lanes)
-        found = builder.call(function, [constant(0, words), place, half, allowed, size])
-        pieces.append(builder.bitcast(found, INTS))
-    return [
-        builder.shuffle_vector(*pieces, ir.Constant(INTS, list(range(which, 2 * LANES, 2))))
-        for which in (0, 1)
-    ]
-
-
-def multiply_add(builder, a, b, c):
-    """A b + c, fused where the processor can."""
-    return builder.fadd(builder.fmul(a, b, flags=FAST), c, flags=FAST)
-
-
-def square_root(builder, vector):
-    """Square roots of a vector of floats."""
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(FLOATS, [FLOATS]), f"llvm.sqrt.v{LANES}f32"
-    )
-    return builder.call(function, [vector])
-
-
-def positive(builder, vector, mask):
-    """The floats of a vector, 0 instead of those that are less and of those not in `mask`."""
-    zero = constant(0.0)
-    kept = builder.and_(mask, builder.fcmp_ordered(">", vector, zero))
-    return builder.select(kept, vector, zero)
-
-
-def lane_sum(builder, vector):
-    """Sum over the lanes of a vector of floats."""
-    function = cgutils.get_or_insert_function(
-        builder.module,
-        ir.FunctionType(ir.FloatType(), [ir.FloatType(), FLOATS]),
-        f"llvm.vector.reduce.fadd.v{LANES}f32",
-    )
-    return builder.call(function, [ir.Constant(ir.FloatType(), -0.0), vector], fastmath=FAST)
-
-
-def vector_loop(builder, start, end, count, body):
-    """A loop over start, start + LANES, ... < end that sums `count` vectors.
+    Sixteen are taken at a time, and eight at the end where so many are left.
 
     Args:
+        builder: of the function.
         start, end: indices.
         count: of sums.
-        body: called with the index, the lanes that are before the end, and the sums so far; returns
-            the new sums.
+        body: called with Vectors, an index, and the vectors of sums so far; returns the new ones.
 
     Returns:
-        The sums, vectors of floats.
+        The sums, floats.
     """
+    wide, narrow = Vectors(builder, 16), Vectors(builder, 8)
     entry = builder.block
-    head = builder.append_basic_block("loop")
-    done = builder.append_basic_block("loop.done")
-    builder.cbranch(builder.icmp_signed("<", start, end), head, done)
+    head, between, tail, done = (
+        builder.append_basic_block(f"sums.{name}") for name in ("head", "between", "tail", "done")
+    )
+    step = ir.Constant(start.type, 16)
+    whole = builder.add(start, builder.and_(builder.sub(end, start), ir.Constant(start.type, -16)))
+    builder.cbranch(builder.icmp_signed("<", start, whole), head, between)
+
     builder.position_at_end(head)
     index = builder.phi(start.type)
     index.add_incoming(start, entry)
-    sums = [builder.phi(FLOATS) for _ in range(count)]
+    sums = [builder.phi(wide.floats) for _ in range(count)]
     for value in sums:
-        value.add_incoming(constant(0.0), entry)
-    rest = builder.trunc(builder.sub(end, index), ir.IntType(32))
-    mask = builder.icmp_signed(
-        "<", ir.Constant(INTS, list(range(LANES))), splat(builder, rest, INTS)
-    )
-    new = body(index, mask, sums)
-    following = builder.add(index, ir.Constant(index.type, LANES))
-    last = builder.block
+        value.add_incoming(wide.constant(0.0), entry)
+    new = body(wide, index, sums)
+    following, last = builder.add(index, step), builder.block
     index.add_incoming(following, last)
     for value, changed in zip(sums, new, strict=True):
         value.add_incoming(changed, last)
-    builder.cbranch(builder.icmp_signed("<", following, end), head, done)
+    builder.cbranch(builder.icmp_signed("<", following, whole), head, between)
+
+    builder.position_at_end(between)
+    halves = []
+    for changed in new:
+        so_far = builder.phi(wide.floats)
+        so_far.add_incoming(wide.constant(0.0), entry)
+        so_far.add_incoming(changed, last)
+        halves.append(so_far)
+    parts = [ir.Constant(narrow.ints, list(range(first, first + 8))) for first in (0, 8)]
+    halves = [
+        builder.fadd(*(builder.shuffle_vector(value, value, part) for part in parts), flags=FAST)
+        for value in halves
+    ]
+    builder.cbranch(builder.icmp_signed("<", whole, end), tail, done)
+
+    builder.position_at_end(tail)
+    new = body(narrow, whole, halves)
+    last = builder.block
+    builder.branch(done)
+
     builder.position_at_end(done)
     results = []
-    for changed in new:
-        result = builder.phi(FLOATS)
-        result.add_incoming(constant(0.0), entry)
-        result.add_incoming(changed, last)
+    for before, after in zip(halves, new, strict=True):
+        result = builder.phi(narrow.floats)
+        result.add_incoming(before, between)
+        result.add_incoming(after, last)
         results.append(result)
-    return results
+    return [narrow.sum(result) for result in results]
 
 
 def _store_set_bits(builder, bits, first, pointer, cursor):
@@ -218,33 +256,33 @@ def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cu
 
     def codegen(context, builder, sig, args):
         xs_, ys_, zs_, begin_, end_, x_, y_, z_, square_, target_, cursor_ = args
-        total = None
+        vectors, total = Vectors(builder, LANES), None
         for array_type, array, centre in zip(
             sig.args[:3], (xs_, ys_, zs_), (x_, y_, z_), strict=True
         ):
-            values = load(builder, data_pointer(context, builder, array_type, array), begin_)
-            offset = builder.fsub(splat(builder, centre), values)
+            values = vectors.load(data_pointer(context, builder, array_type, array), begin_)
+            offset = builder.fsub(vectors.splat(centre), values)
             term = builder.fmul(offset, offset, flags=("contract",))
             total = term if total is None else builder.fadd(total, term, flags=("contract",))
-        near = builder.fcmp_ordered("<", total, splat(builder, square_))
-        lanes = ir.Constant(INTS, list(range(LANES)))
+        near = builder.fcmp_ordered("<", total, vectors.splat(square_))
+        lanes = ir.Constant(vectors.ints, list(range(LANES)))
         room = builder.trunc(builder.sub(end_, begin_), ir.IntType(32))
-        mask = builder.and_(near, builder.icmp_signed("<", lanes, splat(builder, room, INTS)))
+        mask = builder.and_(near, builder.icmp_signed("<", lanes, vectors.splat(room)))
         bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(32))
         first = builder.trunc(begin_, ir.IntType(32))
         target_data = data_pointer(context, builder, sig.args[9], target_)
         target_pointer = builder.gep(target_data, [cursor_])
         if HAS_COMPRESSING_STORE:
-            indices = builder.add(lanes, splat(builder, first, INTS))
+            indices = builder.add(lanes, vectors.splat(first))
             # In a register and then stored whole: the instruction that stores only the hits is
             # several times slower.
             compress = cgutils.get_or_insert_function(
                 builder.module,
-                ir.FunctionType(INTS, [INTS, INTS, _BITS]),
+                ir.FunctionType(vectors.ints, [vectors.ints, vectors.ints, near.type]),
                 f"llvm.x86.avx512.mask.compress.v{LANES}i32",
             )
-            hits = builder.call(compress, [indices, constant(0, INTS), mask])
-            store(builder, hits, target_pointer, ir.Constant(cursor_.type, 0))
+            hits = builder.call(compress, [indices, vectors.constant(0, integer=True), mask])
+            vectors.store(hits, target_pointer, ir.Constant(cursor_.type, 0))
             count = builder.ctpop(bits)
             return builder.add(cursor_, builder.zext(count, cursor_.type))
         return _store_set_bits(builder, bits, first, target_pointer, cursor_)
