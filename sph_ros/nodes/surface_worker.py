@@ -8,7 +8,7 @@ import time
 
 #: A step waits for the slowest of its threads, and each has a processor of its own to itself only
 #: as long as nobody else wants it. Surfaces take what steps leave.
-NICENESS = 10
+NICENESS = 5
 
 
 class SurfaceWorker:
