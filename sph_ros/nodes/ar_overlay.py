@@ -24,11 +24,16 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters.header import NANOSECONDS
-from msg_adapters.image import compressed_image_to_cdr, image_to_cdr
+from msg_adapters.image import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    compressed_image_to_cdr,
+    image_to_cdr,
+)
 from msg_adapters.pose import cdr_to_pose
 from sph_ros.nodes.frames import make_transform
 from sph_ros.nodes.help_texts import help_text
-from sph_ros.nodes.image_source import decoded
+from sph_ros.nodes.image_source import Encoded, decoded
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status
 from sph_ros.nodes.overlay_liquid import LiquidStates, stamp_of
@@ -83,7 +88,14 @@ class ArOverlay(Node):
         self._overlay, self._overlay_camera = None, None
         self._counts = {"drawn": 0, "refused": 0}
         self._milliseconds, self._age, self._offset, self._size = 0.0, 0.0, 0.0, (640, 480)
-        self._topics = PictureTopics(self, self._on_picture, lambda d: self._calibration.hear(d))
+        self._topics = PictureTopics(
+            self,
+            {
+                "camera_info": lambda data: self._calibration.hear(data),
+                "image": lambda data: self._on_picture(Encoded(IMAGE, data)),
+                "compressed": lambda data: self._on_picture(Encoded(COMPRESSED_IMAGE, data)),
+            },
+        )
         kind = self._settings["image_kind"]
         rectified = kind == "rectified" or (
             kind == "auto" and "rect" in self._topics.names["image"]
@@ -128,7 +140,8 @@ class ArOverlay(Node):
             self._inputs = []
             with self._lock:
                 self._matcher = Matcher()
-        self._topics.attend(self._awake_since is not None)
+        awake = self._awake_since is not None
+        self._topics.attend(info=awake, pictures=awake)
 
     def _subscribe(self):
         fluid = self._settings["fluid"].rstrip("/")

@@ -10,15 +10,12 @@ the mailbox, and no picture ever waits behind another.
 import threading
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from msg_adapters.image import COMPRESSED_IMAGE, IMAGE
 from sph_ros.nodes.image_source import Encoded
+from sph_ros.nodes.picture_topics import PictureTopics
 
-_TYPES = {"image": Image, "compressed": CompressedImage, "camera_info": CameraInfo}
 _PICTURES = {"image": IMAGE, "compressed": COMPRESSED_IMAGE}
 
 #: One message cannot be longer in coming than this many others of its publisher; else it restarted.
@@ -38,28 +35,8 @@ class _Unexecuted(CallbackGroup):
         pass
 
 
-def find_topics(node):
-    """Full names of the topics `image`, `compressed` and `camera_info` of a node."""
-    image = node.resolve_topic_name("image")
-    compressed = node.resolve_topic_name("image/compressed")
-    if compressed == node.resolve_topic_name("image/compressed", only_expand=True):
-        compressed = f"{image}/compressed"  # not remapped itself, so it follows the image
-    info = node.resolve_topic_name("camera_info")
-    return {"image": image, "compressed": compressed, "camera_info": info}
-
-
-def acceptable_qos(node, topic):
-    """The best that all publishers of a topic offer: best effort loses large messages."""
-    offered = [one.qos_profile for one in node.get_publishers_info_by_topic(topic)]
-    reliable = all(qos.reliability != ReliabilityPolicy.BEST_EFFORT for qos in offered)
-    # A calibration that was published once and for all is sent to those who ask for it.
-    latched = DurabilityPolicy.TRANSIENT_LOCAL
-    kept = offered and all(qos.durability == latched for qos in offered)
-    return QoSProfile(
-        depth=2,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=latched if kept else DurabilityPolicy.VOLATILE,
-    )
+def _ignore(_data):
+    """The callback that is never called: messages are taken."""
 
 
 class TopicInput:
@@ -69,52 +46,24 @@ class TopicInput:
 
     Args:
         node: that subscribes.
-        topics: names of the topics `image`, `compressed`, `camera_info`.
         hear_camera: called with each camera_info message in CDR bytes.
 
     Attributes:
         dropped: number of pictures that were not fetched, because a newer one was there.
     """
 
-    def __init__(self, node, topics, hear_camera):
+    def __init__(self, node, hear_camera):
         self.dropped = 0
-        self._node = node
-        self._topics = topics
-        self._hear_camera = hear_camera
-        self._group = _Unexecuted()
-        self._subscriptions = {}
+        self._node, self._hear_camera = node, hear_camera
+        callbacks = dict.fromkeys([*_PICTURES, "camera_info"], _ignore)
+        self._topics = PictureTopics(node, callbacks, _Unexecuted())
         self._changed = threading.Event()
         self._last_number = None
 
     def listen(self, awake):
         """Subscribe to what is needed now; to raw pictures rather than compressed ones."""
-        wanted = {"camera_info"}
-        if awake:
-            raw = self._node.count_publishers(self._topics["image"])
-            compressed = self._node.count_publishers(self._topics["compressed"])
-            wanted.add("image" if raw or not compressed else "compressed")
-        for name in self._subscriptions.keys() - wanted:
-            self._node.destroy_subscription(self._subscriptions.pop(name))
-        for name in wanted:
-            self._subscribe(name, acceptable_qos(self._node, self._topics[name]))
-
-    def _subscribe(self, name, qos):
-        """Subscribe to a topic, or once more with another QoS."""
-        present = self._subscriptions.get(name)
-        if present is not None:
-            if present.qos_profile == qos:
-                return
-            self._node.destroy_subscription(present)
-        self._subscriptions[name] = self._node.create_subscription(
-            _TYPES[name],
-            self._topics[name],
-            lambda _data: None,
-            qos,
-            callback_group=self._group,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            raw=True,
-        )
-        self._changed.set()
+        if self._topics.attend(info=True, pictures=awake):
+            self._changed.set()
 
     def get(self, timeout):
         """The newest picture that was not fetched yet, as Encoded; None when none comes in time.
@@ -122,7 +71,7 @@ class TopicInput:
         Args:
             timeout: how long to wait at most [s].
         """
-        subscriptions = self._subscriptions.copy()
+        subscriptions = self._topics.subscriptions.copy()
         name = next((name for name in _PICTURES if name in subscriptions), None)
         messages = []
         try:

@@ -23,10 +23,11 @@ from sph_ros.nodes.help_texts import help_text
 from sph_ros.nodes.image_source import Encoded, Picture, SourceError, decoded, make_source
 from sph_ros.nodes.marker_camera import CalibrationChoice, WaitingError
 from sph_ros.nodes.marker_diagnostics import Problems, input_status, target_status
-from sph_ros.nodes.marker_input import TopicInput, find_topics
+from sph_ros.nodes.marker_input import TopicInput
 from sph_ros.nodes.marker_mailbox import Mailbox
 from sph_ros.nodes.marker_parameters import MEASURED, MarkerParameters, TrackerParameterError
 from sph_ros.nodes.marker_publications import MarkerPublications
+from sph_ros.nodes.picture_topics import find_topics
 from sph_ros.nodes.running import run_node
 from sph_ros.tracking.camera import CameraError
 from sph_ros.tracking.camera_message import CAMERA_INFO
@@ -94,7 +95,7 @@ class MarkerTracker(Node):
             parameters["camera_info_url"], self._rectified(), from_topics or source.brings_camera
         )
         if from_topics:
-            self._inbox = TopicInput(self, self._input_topics, self._calibration.hear)
+            self._inbox = TopicInput(self, self._calibration.hear)
             # Before anything takes long: who sees us hear pictures may send camera_info only once.
             self._inbox.listen(awake=False)
         else:
