@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
+pytest.importorskip("rclpy", reason="ROS is not installed: rclpy cannot be imported")
 
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 from ros_helpers import RosSession  # noqa: E402

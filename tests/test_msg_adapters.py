@@ -58,7 +58,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def rclpy_class(message_type):
-    pytest.importorskip("rclpy")
+    pytest.importorskip("rclpy", reason="ROS is not installed: rclpy cannot be imported")
     package, _, name = message_type.split("/")
     return getattr(__import__(f"{package}.msg", fromlist=[name]), name)
 

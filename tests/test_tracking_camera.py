@@ -141,7 +141,7 @@ def test_sizes_must_match_and_a_guess_says_so():
 
 
 def test_camera_info_message_is_read_as_rclpy_wrote_it():
-    pytest.importorskip("rclpy")
+    pytest.importorskip("rclpy", reason="ROS is not installed: rclpy cannot be imported")
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import CameraInfo, RegionOfInterest
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's failure, cured: a drop pushed by a tracked box stays together as with true poses."""
 
+import math
+
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -64,12 +66,18 @@ def pushed_drop(times, poses):
 def test_no_particle_leaves_the_drop_that_stays_with_true_poses():
     times = np.arange(round(SECONDS * FPS)) / FPS
     truth = push(times)
+    filtered = tracked(times, truth, "kalman")
     left, centre = pushed_drop(times, truth)
-    left_filtered, centre_filtered = pushed_drop(times, tracked(times, truth, "kalman"))
+    left_filtered, centre_filtered = pushed_drop(times, filtered)
     left_plain, centre_plain = pushed_drop(times, tracked(times, truth, "none"))
     print(f"left: {len(left)} true, {len(left_filtered)} filtered, {len(left_plain)} unfiltered")
     assert left_filtered <= left
-    # The drop ends in the same place to a particle; which one is beside which is chance.
-    assert np.linalg.norm(centre_filtered - centre) < 0.0025
-    # The same pictures without filter throw the drop about.
-    assert left_plain - left or np.linalg.norm(centre_plain - centre) > 0.02
+    # A drop is pushed as far as the box, so it ends no farther off than the box was, here 6 mm.
+    # Chance is less: rounding alone, as poses off by 0.01 mm show, moves its end by 0.2 to 0.9 mm,
+    # other noise in the pictures by 0.3 to 2 mm.
+    pairs = zip(filtered, truth, strict=True)
+    farthest = max(math.dist(box.position, true.position) for box, true in pairs if box)
+    assert farthest < 0.01
+    assert np.linalg.norm(centre_filtered - centre) < farthest
+    # The same pictures without filter throw the drop about, by 53 mm.
+    assert left_plain - left or np.linalg.norm(centre_plain - centre) > 3.0 * farthest

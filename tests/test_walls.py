@@ -228,11 +228,12 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("name", SHAPES)
+# The union's box is tilted, which has no meaning in 2D.
+@pytest.mark.parametrize(
+    ("name", "dimension"),
+    [(name, d) for name in SHAPES for d in (2, 3) if (name, d) != ("union", 2)],
+)
 def test_gradients_match_differences(name, dimension):
-    if dimension == 2 and name == "union":
-        pytest.skip("a tilted box has no meaning in 2D")
     generator = np.random.default_rng(7)
     points = generator.uniform(-0.06, 0.06, (3000, 3)).astype(np.float32)
     terms = terms_at(SHAPES[name], points, dimension)
