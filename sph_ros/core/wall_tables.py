@@ -196,6 +196,12 @@ def round_ratio(distance, radius, support_radius, dimension, cylinder=False, inv
     return np.stack(columns, axis=-1) / flat_integral(d, support_radius, dimension, cylinder)
 
 
+@functools.lru_cache(maxsize=64)
+def _round_curve(radius, support_radius, *settings):
+    """`round_ratio` at the distances of a table, (TABLE_STEPS + 1, 2)."""
+    return round_ratio(distances(support_radius), radius, support_radius, *settings)
+
+
 class WallTables:
     """Collects the tables a set of solids needs, each once.
 
@@ -242,9 +248,7 @@ class WallTables:
         key = ("round", radius, inverted, cylinder, mirrored)
         if key in self._index:
             return self._index[key]
-        ratio = round_ratio(
-            self._distances, radius, self.support_radius, self.dimension, cylinder, inverted
-        )
+        ratio = _round_curve(radius, self.support_radius, self.dimension, cylinder, inverted)
         return self._add(key, np.minimum(self._flat[mirrored] * ratio, self.full_cover))
 
     def _add(self, key, table):
