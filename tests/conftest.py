@@ -2,6 +2,9 @@
 """Fixtures that several test modules share."""
 
 import os
+import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -12,6 +15,42 @@ import pytest
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="sph_ros_log_"))
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+
+#: Tests from which on they are the whole suite, which needs all kernels sooner or later.
+MANY = 500
+
+COMPILE = """
+import os
+from sph_ros.sim.kernels import ensure_compiled, everything
+os.nice(5)
+for name in everything():
+    ensure_compiled([name])
+"""
+
+
+def pytest_collection_finish(session):
+    """Compile beside the first tests: most of those leave a processor idle for three minutes."""
+    jit = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
+    if len(session.items) >= MANY and jit and not session.config.option.collectonly:
+        root = str(Path(__file__).resolve().parents[1])
+        paths = filter(None, [root, os.environ.get("PYTHONPATH")])
+        session.compiler = subprocess.Popen(
+            [sys.executable, "-c", COMPILE],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+
+def pytest_sessionfinish(session):
+    """End what still compiles, its children too."""
+    compiler = getattr(session, "compiler", None)
+    if compiler is not None and compiler.poll() is None:
+        os.killpg(compiler.pid, signal.SIGTERM)
+        compiler.wait()
 
 
 @pytest.fixture(scope="session")
