@@ -4,11 +4,11 @@
     python benchmarks/bench_node.py [--scene ball_tank_large] [--seconds 5]
 
 The node runs with `speed` so high that it never waits: the real-time factor is then what the
-machine can do. The hand moves at 0.24 m/s of simulated time. Latency is measured at speed 1, with every step published, in this scene and in a
-small one: a pose 2 mm away is sent, and the time is taken until a ~/solids message arrives here in
-which the ball has begun to move, and one in which it has arrived. Arriving takes `smoothing_time`
-(50 ms) by design when poses are as rare as here. The bound is two steps and 5 ms, a step as long as
-it takes.
+machine can do. The hand moves at 0.24 m/s of simulated time. Latency is measured at speed 1, with
+every step published, in this scene and in a small one: a pose 2 mm away is sent, and the time is
+taken until a ~/solids message arrives here in which the ball has begun to move, and one in which it
+has arrived. Arriving takes `smoothing_time` (50 ms) by design when poses are as rare as here. The
+bound is two steps and 5 ms, a step as long as it takes.
 """
 
 import argparse
