@@ -174,7 +174,8 @@ def _check(options):
     solids = ", ".join(f"{solid.name} ({solid.control})" for solid in scene.solids) or "none"
     print(f"{scene.source}: good")
     more = f", at most {sim.capacity:,}" if scene.emitters else ""
-    print(f"particles: {count:,}{more} of {scene.material.name}, spacing {scene.spacing:g} m")
+    liquids = " and ".join(dict.fromkeys(liquid.name for liquid in scene.liquids))
+    print(f"particles: {count:,}{more} of {liquids}, spacing {scene.spacing:g} m")
     print(f"solver:    {scene.solver}, {scene.dimension}D")
     print(f"time step: {sim.time_step * 1e3:.3g} ms ({chosen})")
     print(f"solids:    {solids}")

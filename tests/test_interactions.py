@@ -38,7 +38,7 @@ def test_uncoupled_particles_fly_parabolas_through_each_other_and_stay_on_the_gr
         sim.step()
     t = sim.time
     expected = x + t * v - 0.5 * 9.81 * t * t * np.array([0, 0, 1.0])
-    np.testing.assert_allclose(sim.positions, expected, atol=1e-5)
+    np.testing.assert_allclose(sim.positions, expected, atol=1e-6)
     assert (sim.positions[:125, 0] > sim.positions[125:, 0]).all()
     sim.advance(0.5)
     assert sim.positions[:, 2].max() < 0.001

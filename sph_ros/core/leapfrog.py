@@ -47,8 +47,11 @@ def take_stops(starts, origins, wanted, ends, inverse_step, velocities):
     """
     for i in prange(ends.shape[0]):
         for axis in range(3):
-            stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
-            velocities[i, axis] += stop * inverse_step
+            # Only where there was a stop: terms of this sum may be taken in another order, and then
+            # their rounding would brake what flies freely.
+            if ends[i, axis] != wanted[i, axis] or origins[i, axis] != starts[i, axis]:
+                stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
+                velocities[i, axis] += stop * inverse_step
 
 
 @parallel_kernel
