@@ -43,7 +43,7 @@ def test_a_glass_is_filled_and_nothing_is_spilled():
     assert np.percentile(sim.positions[:, 2], 97) == pytest.approx(level, abs=0.006)
     last = force[-round(0.4 / sim.time_step) :]
     assert np.mean(last) == pytest.approx(-1000 * volume * 9.81, rel=0.02)
-    assert facts["mean_speed"] < 0.05  # it still turns; the jet comes down with 1.9 m/s
+    assert facts["mean_speed"] < 0.05  # particles rattle; the jet had 1.9 m/s
 
 
 def test_two_drops_become_one_that_is_round():
