@@ -263,13 +263,14 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
 
 @parallel_kernel
 def sum_densities(
-    columns, support_radius, density_scale, near_scale, wall_density, chunks, pairs, sums
+    columns, support_radius, power, density_scale, near_scale, wall_density, chunks, pairs, sums
 ):
     """Pair geometry, both densities and gradient sums of every particle (Clavet 2005, Alg. 2).
 
     Args:
         columns: as in `find_neighbors`.
         support_radius: h [m], float32.
+        power: of the density's weight (1 - r/h)^power, 2 or 3, float32.
         density_scale, near_scale: 1 / lattice sums of the two weights [-], float32.
         wall_density: density and near-density that walls add [-], (N, 2).
         chunks: `chunk_count(N)`.
@@ -277,13 +278,14 @@ def sum_densities(
         sums: all written.
     """
     inverse_h = np.float32(1.0) / support_radius
-    slope = np.float32(-2.0) * density_scale * inverse_h
+    slope = -power * density_scale * inverse_h
+    bend = power - np.float32(2.0)
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
     count = pairs.start.shape[0]
     for chunk in prange(chunks):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h)
+            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h, bend)
             # Each entry that only fills the list has counted as the particle itself, with weight 1.
             filling = np.float32(pairs.end[i] - pairs.start[i] - pairs.count[i])
             density[i] = density_scale * (w - filling) + wall_density[i, 0]
@@ -291,7 +293,7 @@ def sum_densities(
             gradient[i, 0] = x
             gradient[i, 1] = y
             gradient[i, 2] = z
-            # Every entry counts slope^2 (1 - r/h)^2 here, the particle itself one time too many.
+            # Every entry counts its squared gradient here, the particle itself slope^2 each time.
             gradient_square[i] = square - slope * slope * (filling + np.float32(1.0))
 
 

@@ -67,6 +67,11 @@ def _unpacked(builder, v, source, indices):
     return [builder.sitofp(number, v.floats) for number in whole]
 
 
+def _bent(builder, v, bend, u):
+    """What the weight is times u^2: 1, or u where `bend` is 1; see `geometry_of_pairs`."""
+    return v.multiply_add(bend, builder.fsub(u, v.constant(1.0), flags=FAST), v.constant(1.0))
+
+
 # ---------------------------------------------------------------- pushes
 
 
@@ -210,10 +215,10 @@ def _impulse_in_vectors(typingctx, neighbors, gradients, velocities, start, end,
         source = data_pointer(context, builder, sig.args[2], velocities_)
         sources = [builder.gep(source, [ir.Constant(start_.type, axis)]) for axis in range(3)]
         centre = [builder.extract_value(own_, axis) for axis in range(3)]
-        rates_ = [builder.extract_value(rates_, which) for which in range(3)]
+        rates_ = [builder.extract_value(rates_, which) for which in range(4)]
 
         def body(v, k, sums):
-            linear, quadratic, most = (v.splat(rate) for rate in rates_)
+            linear, quadratic, most, bend = (v.splat(rate) for rate in rates_)
             columns = v.constant(3, integer=True)
             indices = builder.mul(v.load(js, k, integer=True), columns)
             gradient = [v.load(row, k) for row in rows[:3]]
@@ -222,8 +227,9 @@ def _impulse_in_vectors(typingctx, neighbors, gradients, velocities, start, end,
             for slope, velocity, there in zip(gradient, centre, sources, strict=True):
                 relative = builder.fsub(v.splat(velocity), v.gather(there, indices), flags=FAST)
                 along = v.multiply_add(relative, slope, along)
-            shifted = builder.fadd(u, v.constant(1e-3), flags=FAST)
-            inverse_u = builder.fdiv(v.constant(1.0), shifted)
+            above = builder.fadd(u, v.constant(1e-3), flags=FAST)
+            above = builder.fmul(above, _bent(builder, v, bend, above), flags=FAST)
+            inverse_u = builder.fdiv(v.constant(1.0), above)
             approach = builder.fmul(v.positive(along), inverse_u, flags=FAST)
             wanted = v.multiply_add(quadratic, approach, linear)
             taken = builder.select(builder.fcmp_ordered("<", wanted, most), wanted, most)
@@ -241,7 +247,7 @@ def _impulse_in_vectors(typingctx, neighbors, gradients, velocities, start, end,
 
 
 @inlined
-def _impulse_by_hand(pairs, velocities, i, linear, quadratic, most):
+def _impulse_by_hand(pairs, velocities, i, linear, quadratic, most, bend):
     return _impulse_in_vectors(
         pairs.neighbors,
         pairs.gradients,
@@ -249,13 +255,13 @@ def _impulse_by_hand(pairs, velocities, i, linear, quadratic, most):
         pairs.start[i],
         pairs.end[i],
         (velocities[i, 0], velocities[i, 1], velocities[i, 2]),
-        (linear, quadratic, most),
+        (linear, quadratic, most, bend),
     )
 
 
 @inlined
-def _impulse_plainly(pairs, velocities, i, linear, quadratic, most):
-    zero = np.float32(0.0)
+def _impulse_plainly(pairs, velocities, i, linear, quadratic, most, bend):
+    zero, one = np.float32(0.0), np.float32(1.0)
     vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
     ax, ay, az = zero, zero, zero
     start, end = pairs.start[i], pairs.end[i]
@@ -269,7 +275,8 @@ def _impulse_plainly(pairs, velocities, i, linear, quadratic, most):
             + (vy - velocities[j, 1]) * gy[k]
             + (vz - velocities[j, 2]) * gz[k]
         )
-        inverse_u = np.float32(1.0) / (us[k] + np.float32(1e-3))
+        above = us[k] + np.float32(1e-3)
+        inverse_u = one / (above * (one + bend * (above - one)))
         taken = min(linear + quadratic * max(along, zero) * inverse_u, most)
         c = us[k] * taken * along * inverse_u * inverse_u
         ax += c * gx[k]
@@ -282,19 +289,21 @@ _impulse = _impulse_by_hand if HAS_GATHER else _impulse_plainly
 
 
 @inlined
-def impulse_of_pairs(pairs, velocities, i, linear, quadratic, most):
-    """Sum of (1 - r/h) q_ij g_ij ((v_i - v_j) . g_ij) / (1 - r/h)^2 over the neighbours of i.
+def impulse_of_pairs(pairs, velocities, i, linear, quadratic, most, bend):
+    """Sum of (1 - r/h) q_ij n_ij ((v_i - v_j) . n_ij) over the neighbours of i.
 
-    With q_ij = min(linear + quadratic c_ij, most), and c_ij the speed at which i and j approach
-    each other, (v_i - v_j) . g_ij / (1 - r/h), or 0 if they do not.
+    With n_ij the gradient over (1 - r/h), or where the weight is cubic over (1 - r/h)^2;
+    q_ij = min(linear + quadratic c_ij, most), and c_ij the speed at which i and j approach each
+    other, (v_i - v_j) . n_ij, or 0 if they do not.
 
     Args:
         pairs: from `sum_densities`.
         velocities: [m/s], (N, 3).
         i: row of the particle.
         linear, quadratic, most: float32.
+        bend: as in `geometry_of_pairs`.
     """
-    return _impulse(pairs, velocities, i, linear, quadratic, most)
+    return _impulse(pairs, velocities, i, linear, quadratic, most, bend)
 
 
 # ---------------------------------------------------------------- densities after displacements
@@ -302,7 +311,7 @@ def impulse_of_pairs(pairs, velocities, i, linear, quadratic, most):
 
 @intrinsic
 def _growth_in_vectors(
-    typingctx, neighbors, gradients, columns, packed, start, end, at, way, unit, inverse_h
+    typingctx, neighbors, gradients, columns, packed, start, end, at, way, units
 ):
     signature = types.UniTuple(types.float32, 2)(
         neighbors,
@@ -313,12 +322,12 @@ def _growth_in_vectors(
         types.intp,
         at,
         way,
-        types.float32,
-        types.float32,
+        units,
     )
 
     def codegen(context, builder, sig, args):
-        neighbors_, gradients_, columns_, packed_, start_, end_, at_, way_, unit_, inverse_ = args
+        neighbors_, gradients_, columns_, packed_, start_, end_, at_, way_, units_ = args
+        unit_, inverse_, bend_ = (builder.extract_value(units_, which) for which in range(3))
         js = data_pointer(context, builder, sig.args[0], neighbors_)
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
         places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
@@ -344,8 +353,10 @@ def _growth_in_vectors(
             share = builder.fmul(v.square_root(square), v.splat(inverse_), flags=FAST)
             u = v.positive(builder.fsub(v.constant(1.0), share, flags=FAST))
             before = v.load(rows[3], k)
-            grown = v.multiply_add(u, u, grown)
-            grown = builder.fsub(grown, builder.fmul(before, before, flags=FAST), flags=FAST)
+            for value, add in ((u, builder.fadd), (before, builder.fsub)):
+                square = builder.fmul(value, value, flags=FAST)
+                weight = builder.fmul(square, _bent(builder, v, v.splat(bend_), value), flags=FAST)
+                grown = add(grown, weight, flags=FAST)
             return [grown, linear]
 
         sums = sums_in_vectors(builder, start_, end_, 2, body)
@@ -355,7 +366,7 @@ def _growth_in_vectors(
 
 
 @inlined
-def _growth_by_hand(pairs, columns, displacements, packed, i, support_radius):
+def _growth_by_hand(pairs, columns, displacements, packed, i, support_radius, bend):
     # Its own displacement packed, too: only then a particle does not move against itself.
     return _growth_in_vectors(
         pairs.neighbors,
@@ -366,13 +377,12 @@ def _growth_by_hand(pairs, columns, displacements, packed, i, support_radius):
         pairs.end[i],
         (columns[0, i], columns[1, i], columns[2, i]),
         unpacked(packed[i]),
-        resolution(support_radius),
-        np.float32(1.0) / support_radius,
+        (resolution(support_radius), np.float32(1.0) / support_radius, bend),
     )
 
 
 @inlined
-def _growth_plainly(pairs, columns, displacements, packed, i, support_radius):
+def _growth_plainly(pairs, columns, displacements, packed, i, support_radius, bend):
     one, zero = np.float32(1.0), np.float32(0.0)
     inverse_h = one / support_radius
     xs, ys, zs = columns[0], columns[1], columns[2]
@@ -392,7 +402,9 @@ def _growth_plainly(pairs, columns, displacements, packed, i, support_radius):
         dx, dy, dz = x - xs[j] + mx, y - ys[j] + my, z - zs[j] + mz
         u = one - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
         u = u if u > zero else zero
-        grown += u * u - us[k] * us[k]
+        before = us[k]
+        grown += u * u * (one + bend * (u - one))
+        grown -= before * before * (one + bend * (before - one))
     return grown, linear
 
 
@@ -400,25 +412,24 @@ _growth = _growth_by_hand if HAS_GATHER else _growth_plainly
 
 
 @inlined
-def growth_by_pairs(pairs, columns, displacements, packed, i, support_radius):
-    """What particle i's sum over neighbours of (1 - r/h)^2 grows by, and linearised.
+def growth_by_pairs(pairs, columns, displacements, packed, i, support_radius, bend):
+    """What particle i's sum of weights over its neighbours grows by, and linearised.
 
     The second is in units of density, see `divergence_of_pairs`.
 
     Args:
         pairs, displacements, packed, i, support_radius: as in `divergence_of_pairs`.
         columns: coordinates before [m], as in `find_neighbors`.
+        bend: as in `geometry_of_pairs`.
     """
-    return _growth(pairs, columns, displacements, packed, i, support_radius)
+    return _growth(pairs, columns, displacements, packed, i, support_radius, bend)
 
 
 # ---------------------------------------------------------------- geometry
 
 
 @intrinsic
-def _geometry_in_vectors(
-    typingctx, neighbors, gradients, columns, start, end, at, slope, inverse_h
-):
+def _geometry_in_vectors(typingctx, neighbors, gradients, columns, start, end, at, units):
     signature = types.UniTuple(types.float32, 6)(
         neighbors,
         gradients,
@@ -426,12 +437,12 @@ def _geometry_in_vectors(
         types.intp,
         types.intp,
         at,
-        types.float32,
-        types.float32,
+        units,
     )
 
     def codegen(context, builder, sig, args):
-        neighbors_, gradients_, columns_, start_, end_, at_, slope_, inverse_ = args
+        neighbors_, gradients_, columns_, start_, end_, at_, units_ = args
+        slope_, inverse_, bend_ = (builder.extract_value(units_, which) for which in range(3))
         js = data_pointer(context, builder, sig.args[0], neighbors_)
         rows = [data_pointer(context, builder, sig.args[1], gradients_, row) for row in range(4)]
         places = [data_pointer(context, builder, sig.args[2], columns_, row) for row in range(3)]
@@ -448,10 +459,11 @@ def _geometry_in_vectors(
             share = builder.fmul(square, inverse_r, flags=FAST)
             share = builder.fmul(share, v.splat(inverse_), flags=FAST)
             u = builder.fsub(v.constant(1.0), share, flags=FAST)
-            length = builder.fmul(v.splat(slope_), u, flags=FAST)
+            bent = _bent(builder, v, v.splat(bend_), u)
+            length = builder.fmul(builder.fmul(v.splat(slope_), u, flags=FAST), bent, flags=FAST)
             factor = builder.fmul(length, inverse_r, flags=FAST)
             u2 = builder.fmul(u, u, flags=FAST)
-            new = [builder.fadd(sums[0], u2, flags=FAST), v.multiply_add(u2, u, sums[1])]
+            new = [v.multiply_add(u2, bent, sums[0]), v.multiply_add(u2, u, sums[1])]
             new.append(v.multiply_add(length, length, sums[2]))
             v.store(u, rows[3], k)
             for axis in range(3):
@@ -467,7 +479,7 @@ def _geometry_in_vectors(
 
 
 @inlined
-def _geometry_by_hand(pairs, columns, i, slope, inverse_h):
+def _geometry_by_hand(pairs, columns, i, slope, inverse_h, bend):
     return _geometry_in_vectors(
         pairs.neighbors,
         pairs.gradients,
@@ -475,13 +487,12 @@ def _geometry_by_hand(pairs, columns, i, slope, inverse_h):
         pairs.start[i],
         pairs.end[i],
         (columns[0, i], columns[1, i], columns[2, i]),
-        slope,
-        inverse_h,
+        (slope, inverse_h, bend),
     )
 
 
 @inlined
-def _geometry_plainly(pairs, columns, i, slope, inverse_h):
+def _geometry_plainly(pairs, columns, i, slope, inverse_h, bend):
     one = np.float32(1.0)
     xs, ys, zs = columns[0], columns[1], columns[2]
     x, y, z = xs[i], ys[i], zs[i]
@@ -504,10 +515,12 @@ def _geometry_plainly(pairs, columns, i, slope, inverse_h):
         inverse_r = one / np.sqrt(r2)
         u = one - r2 * inverse_r * inverse_h
         us[k] = u
-        gx[k] = slope * u * inverse_r
-        w += u * u
+        bent = one + bend * (u - one)
+        length = slope * u * bent
+        gx[k] = length * inverse_r
+        w += u * u * bent
         n += u * u * u
-        square += slope * slope * u * u
+        square += length * length
     for k in range(js.shape[0]):
         c = gx[k] * (y - ys[js[k]])
         gy[k] = c
@@ -527,7 +540,7 @@ _geometry = _geometry_by_hand if HAS_GATHER else _geometry_plainly
 
 
 @inlined
-def geometry_of_pairs(pairs, columns, i, slope, inverse_h):
+def geometry_of_pairs(pairs, columns, i, slope, inverse_h, bend):
     """Gradients of the pairs of particle i, and sums over them.
 
     Args:
@@ -536,9 +549,11 @@ def geometry_of_pairs(pairs, columns, i, slope, inverse_h):
         i: row of the particle.
         slope: derivative of the normalised density weight at r = 0 [1/m], float32.
         inverse_h: 1 / h [1/m], float32.
+        bend: 0 for the weight (1 - r/h)^2, 1 for (1 - r/h)^3; gradients are the slope times the
+            weight over (1 - r/h), float32.
 
     Returns:
-        Sums of (1 - r/h)^2, (1 - r/h)^3 and slope^2 (1 - r/h)^2, in which a particle counts as its
-        own neighbour as often as the list has it; sum of the gradients, x, y, z.
+        Sums of the weight, of (1 - r/h)^3 and of the squared gradients, in which a particle counts
+        as its own neighbour as often as the list has it; sum of the gradients, x, y, z.
     """
-    return _geometry(pairs, columns, i, slope, inverse_h)
+    return _geometry(pairs, columns, i, slope, inverse_h, bend)

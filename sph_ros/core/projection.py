@@ -81,6 +81,7 @@ def density_targets(
     displacements,
     packed,
     support_radius,
+    power,
     density_scale,
     pairs,
     density,
@@ -100,6 +101,7 @@ def density_targets(
         columns: positions [m], as in `find_neighbors`.
         displacements, packed: expected ones, from `pressure_displacements`.
         support_radius: h [m], float32.
+        power: of the density's weight, as in `sum_densities`.
         density_scale: 1 / lattice sum of the weight [-], float32.
         pairs: from `sum_densities` at `positions`.
         density: at `positions`, relative to rest [-], (N,).
@@ -113,8 +115,11 @@ def density_targets(
             (N,); written.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
+    bend = power - np.float32(2.0)
     for i in prange(targets.shape[0]):
-        grown, linear = growth_by_pairs(pairs, columns, displacements, packed, i, support_radius)
+        grown, linear = growth_by_pairs(
+            pairs, columns, displacements, packed, i, support_radius, bend
+        )
         excess = density[i] - one
         if excess > zero:
             excess = share * min(excess, MILD) + rest * max(excess - MILD, zero)

@@ -102,7 +102,7 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
 
 
 @parallel_kernel
-def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, changed):
+def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, power, changed):
     """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
 
     The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also
@@ -112,32 +112,35 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, changed)
     Args:
         pairs: from `sum_densities`.
         velocities: [m/s], (N, 3).
-        slope: length of a pair's gradient divided by (1 - r/h) [1/m], float32.
+        slope: length of a pair's gradient divided by (1 - r/h)^(power - 1) [1/m], float32.
         linear: impulse per relative speed, time step included [-], float32.
         quadratic: impulse per squared relative speed, time step included [s/m], float32.
         most: share of the relative speed that a pair at zero distance may take [-], float32.
+        power: of the density's weight, as in `sum_densities`.
         changed: velocities afterwards [m/s], (N, 3); written.
     """
     inverse_slope2 = np.float32(1.0) / (slope * slope)
+    bend = power - np.float32(2.0)
     for i in prange(velocities.shape[0]):
-        x, y, z = impulse_of_pairs(pairs, velocities, i, linear, quadratic / slope, most)
+        x, y, z = impulse_of_pairs(pairs, velocities, i, linear, quadratic / slope, most, bend)
         changed[i, 0] = velocities[i, 0] - inverse_slope2 * x
         changed[i, 1] = velocities[i, 1] - inverse_slope2 * y
         changed[i, 2] = velocities[i, 2] - inverse_slope2 * z
 
 
 @parallel_kernel
-def viscous_operator(pairs, velocities, slope, linear, result):
+def viscous_operator(pairs, velocities, slope, linear, power, result):
     """Left side of implicit viscosity: v minus the linear impulses that v itself would cause.
 
     Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum
     is kept by every iteration.
 
     Args:
-        pairs, velocities, slope, linear: as in `viscous_impulses`.
+        pairs, velocities, slope, linear, power: as in `viscous_impulses`.
         result: [m/s], (N, 3); written.
     """
     scale = linear / (slope * slope)
+    one, bend = np.float32(1.0), power - np.float32(2.0)
     for i in prange(velocities.shape[0]):
         vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -152,7 +155,9 @@ def viscous_operator(pairs, velocities, slope, linear, result):
                 + (vy - velocities[j, 1]) * gy[k]
                 + (vz - velocities[j, 2]) * gz[k]
             )
-            c = scale * along / (us[k] + np.float32(1e-3))
+            above = us[k] + np.float32(1e-3)
+            bent = one + bend * (above - one)
+            c = scale * along / (above * bent * bent)
             ax += c * gx[k]
             ay += c * gy[k]
             az += c * gz[k]

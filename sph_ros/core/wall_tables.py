@@ -214,6 +214,11 @@ class WallTables:
         self.support_radius = support_radius
         self.spacing = spacing
         self.dimension = dimension
+        # Ratios of round walls are those of the weights that they are known for.
+        self.columns = [
+            POWERS.index(weight) if weight in POWERS else column
+            for column, weight in enumerate(weights)
+        ]
         self._index = {}
         self._tables = []
         self._distances = distances(support_radius)
@@ -249,6 +254,7 @@ class WallTables:
         if key in self._index:
             return self._index[key]
         ratio = _round_curve(radius, self.support_radius, self.dimension, cylinder, inverted)
+        ratio = ratio[:, self.columns]
         return self._add(key, np.minimum(self._flat[mirrored] * ratio, self.full_cover))
 
     def _add(self, key, table):

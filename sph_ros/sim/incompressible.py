@@ -9,6 +9,7 @@ import numpy as np
 from sph_ros.core import neighbors as search
 from sph_ros.core import pressure as core
 from sph_ros.core import projection as project
+from sph_ros.core.weights import NEAR_POWER, SMOOTH_POWER
 from sph_ros.sim.liquid import initial_length
 from sph_ros.sim.pressure import Goal
 from sph_ros.sim.pressure_solver import PressureSolver
@@ -21,15 +22,14 @@ from sph_ros.sim.scales import (
 )
 from sph_ros.sim.surface_tension import SurfaceTension, noticeable, ripple_step
 
-#: Share of the support radius that the fastest expected particle crosses in a step. At 0.6 the
-#: pressure at the bottom of a still tank, which is now and then a third above that of its depth,
-#: asks for two substeps (`SURGE`); that costs more than steps that are an eighth shorter.
-COURANT = 0.53
+#: Share of the support radius that the fastest expected particle crosses in a step. In a still tank
+#: sqrt(2 p / rho) crosses as much, and now and then an eighth more: `SURGE` has to be larger.
+COURANT = 0.4
 
 #: Share of an excess of density that a step of the longest stable length takes back; shorter ones
 #: take back less, in proportion, since a way that is made in less time is a higher speed. All of it
 #: at once would turn every error of the iteration into velocity.
-CORRECTED = 0.4
+CORRECTED = 0.1
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
@@ -44,7 +44,7 @@ STEEPEST = 1.0
 #: Share of the support radius that sqrt(2 p / rho) crosses in a substep, with p the pressure that
 #: all but `PEAKS` of the particles stay below. A pressure is stiff against shear like p / h^2;
 #: particles that are pushed, not dropped, have one that their speed says nothing about.
-SURGE, PEAKS = 0.7, 0.005
+SURGE, PEAKS = 0.5, 0.005
 
 #: Particles below this density, or pressed by less than a layer's weight, are at a free surface;
 #: there is one if so many are [-].
@@ -52,12 +52,13 @@ SURFACE_DENSITY, SURFACE_SHARE = 0.85, 0.01
 
 #: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
 #: Nothing else damps a symplectic step. Liquids that are thicker by themselves get none of it.
-LATTICE_VISCOSITY = 0.005
+LATTICE_VISCOSITY = 0.002
 
 
 class IncompressibleSolver(PressureSolver):
     """Pressures that hold the density of the next positions; see `core.projection`."""
 
+    WEIGHTS = (SMOOTH_POWER, NEAR_POWER)
     courant = COURANT
 
     def __init__(self, scene, solids, depth):
@@ -246,6 +247,7 @@ class IncompressibleSolver(PressureSolver):
             work.displacements,
             work.packed,
             self._h,
+            np.float32(self._power),
             np.float32(self.scales.density_scale * self._packing),
             work.pairs,
             work.sums.density,

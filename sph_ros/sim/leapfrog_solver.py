@@ -9,7 +9,7 @@ from sph_ros.core import contacts as touch
 from sph_ros.core import leapfrog
 from sph_ros.core import neighbors as search
 from sph_ros.core.wall_tables import POWERS
-from sph_ros.core.weights import lattice_sum
+from sph_ros.core.weights import DENSITY_POWER, lattice_sum
 from sph_ros.sim.solver import Solver
 
 #: Viscous rate between liquid and a solid that fills the support, as a multiple of the kinematic
@@ -173,6 +173,7 @@ class LeapfrogSolver(Solver):
         search.sum_densities(
             work.columns,
             self._h,
+            np.float32(DENSITY_POWER),
             *scales,
             work.contacts.density,
             work.chunks,

@@ -347,12 +347,12 @@ def pack_shapes(
         node_table=_stacked(table, np.int32, (2,)),
         node_grid=_stacked(grid, np.int32, ()),
         tables=packer.tables.stacked(),
-        **_packed_grids([grid for _, grid in packer.grids.values()]),
+        **_packed_grids([grid for _, grid in packer.grids.values()], packer.tables.columns),
     )
 
 
-def _packed_grids(grids: list[DistanceGrid]) -> dict[str, np.ndarray]:
-    """The grid fields of PackedShapes."""
+def _packed_grids(grids: list[DistanceGrid], columns: list[int]) -> dict[str, np.ndarray]:
+    """The grid fields of PackedShapes, with these columns of the ratios."""
     counts = [grid.distance.size for grid in grids]
     empty = [np.empty((0,), np.float32)]
     return {
@@ -362,6 +362,7 @@ def _packed_grids(grids: list[DistanceGrid]) -> dict[str, np.ndarray]:
         "grid_start": _stacked(np.cumsum([0, *counts])[:-1], np.int64, ()),
         "grid_distance": np.concatenate([grid.distance.ravel() for grid in grids] or empty),
         "grid_ratio": np.concatenate(
-            [grid.ratio.reshape(-1, 2) for grid in grids] or [np.empty((0, 2), np.float32)]
+            [grid.ratio.reshape(-1, 2)[:, columns] for grid in grids]
+            or [np.empty((0, 2), np.float32)]
         ),
     }

@@ -7,10 +7,9 @@ from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import pressure as core
 from sph_ros.core import relaxation as relax
-from sph_ros.core.weights import DENSITY_POWER
 from sph_ros.sim.coupling import Coupling
 from sph_ros.sim.pressure import UNKNOWN, jacobi_share, solve_pressures
-from sph_ros.sim.scales import packing, solver_scales, stable_time_step
+from sph_ros.sim.scales import density_power, packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
 from sph_ros.sim.stress import Weights, virial_pressures, walls_share
 from sph_ros.sim.viscosity import Rates, apply_viscosity
@@ -32,7 +31,10 @@ class PressureSolver(Solver):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
         super().__init__(scene, solids, depth)
         self._packing = packing(scene, 0.0)
-        self._most_share = jacobi_share(scene.support_radius, scene.spacing, scene.dimension)
+        self._power = density_power(scene.solver)
+        self._most_share = jacobi_share(
+            scene.support_radius, scene.spacing, scene.dimension, self._power
+        )
         self._share = self._most_share
         self._coupling = None
 
@@ -64,10 +66,11 @@ class PressureSolver(Solver):
         sums, scales, scene = self._work.sums, self.scales, self._scene
         weights = Weights(
             float(self._h),
-            DENSITY_POWER * scales.density_scale * self._packing / float(self._h),
+            self._power,
+            self._power * scales.density_scale * self._packing / float(self._h),
             self._near_ratio(),
             scales.virial * self._packing,
-            walls_share(scene.support_radius, scene.spacing, scene.dimension),
+            walls_share(self._power, scene.support_radius, scene.spacing, scene.dimension),
             scene.dimension,
         )
         tension = scales.cohesion * (sums.density - 1.0) - scales.near
@@ -91,6 +94,7 @@ class PressureSolver(Solver):
         search.sum_densities(
             work.columns,
             self._h,
+            np.float32(self._power),
             np.float32(self.scales.density_scale * self._packing),
             np.float32(self.scales.near_scale),
             work.contacts.density,
@@ -188,7 +192,8 @@ class PressureSolver(Solver):
         """How strongly the liquid rubs in a substep, `Rates`."""
         scales, friction = self.scales, self._material.wall_friction
         return Rates(
-            slope=DENSITY_POWER * scales.density_scale * self._packing / float(self._h),
+            power=self._power,
+            slope=self._power * scales.density_scale * self._packing / float(self._h),
             linear=scales.viscous_rate * time_step,
             quadratic=scales.quadratic * time_step,
             neighbors=scales.neighbors,

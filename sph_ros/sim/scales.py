@@ -34,7 +34,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, gradient_sum, lattice_sum
+from sph_ros.core.weights import (
+    DENSITY_POWER,
+    NEAR_POWER,
+    SMOOTH_POWER,
+    gradient_sum,
+    lattice_sum,
+)
 from sph_ros.sim.jets import emission_height, make_jet
 
 #: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none,
@@ -51,8 +57,8 @@ FLOWED_SHARE = {
         3: ((1.6, 0.988), (2.0, 0.952), (2.5, 0.959), (3.0, 0.990)),
     },
     "incompressible": {
-        2: ((1.6, 0.999), (2.0, 0.995), (2.5, 0.992), (3.0, 0.982)),
-        3: ((1.6, 1.000), (2.0, 0.954), (2.5, 0.982), (3.0, 0.971)),
+        2: ((1.6, 1.000), (2.0, 0.996), (2.5, 0.995), (3.0, 0.988)),
+        3: ((1.6, 0.992), (2.0, 0.995), (2.5, 0.989), (3.0, 0.977)),
     },
 }
 
@@ -99,6 +105,11 @@ class Scales:
     elasticity: float
 
 
+def density_power(solver):
+    """Power of the weight of the density."""
+    return SMOOTH_POWER if solver == "incompressible" else DENSITY_POWER
+
+
 def packing(scene, time):
     """Rest density of the lattice over that of the liquid at a time [s] after the start [-]."""
     ratios, shares = zip(*FLOWED_SHARE[scene.solver][scene.dimension], strict=True)
@@ -129,7 +140,8 @@ def solver_scales(material, scene, depth):
     """The solver's numbers for `material` in `scene` with liquid `depth` [m] deep."""
     h, s, d = scene.support_radius, scene.spacing, scene.dimension
     g = math.sqrt(sum(c * c for c in scene.gravity))
-    virial = gradient_sum(DENSITY_POWER, h, s, d)
+    power = density_power(scene.solver)
+    virial = gradient_sum(power, h, s, d)
     near_virial = gradient_sum(NEAR_POWER, h, s, d)
     cohesion = material.surface_tension / surface_energy(h, s, d)
     return Scales(
@@ -139,13 +151,13 @@ def solver_scales(material, scene, depth):
         stiffness=material.density * max(g * depth, LEAST_SPEED**2) / material.compression,
         cohesion=cohesion,
         near=NEAR_SHARE * cohesion,
-        density_scale=1.0 / lattice_sum(DENSITY_POWER, h, s, d),
+        density_scale=1.0 / lattice_sum(power, h, s, d),
         near_scale=1.0 / lattice_sum(NEAR_POWER, h, s, d),
         near_virial_ratio=virial / near_virial,
         viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
         neighbors=sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d,
-        wall_layers=_wall_layers(h, s, d),
+        wall_layers=_wall_layers(power, h, s, d),
         elasticity=material.elasticity,
     )
 
@@ -186,7 +198,7 @@ def surface_energy(support_radius, spacing, dimension):
     return excess
 
 
-def _wall_layers(support_radius, spacing, dimension):
+def _wall_layers(power, support_radius, spacing, dimension):
     """Pair rates that a wall which holds the liquid is worth, per wall fraction [-]."""
     reach = math.ceil(support_radius / spacing)
     total = 0.0
@@ -195,7 +207,7 @@ def _wall_layers(support_radius, spacing, dimension):
         if offset[-1] > 0 and r * spacing < support_radius:
             cosine = offset[0] / r
             total += (1 - r * spacing / support_radius) * cosine**2 * 2 * offset[-1]
-    return total / _missing(DENSITY_POWER, support_radius, spacing, dimension, 0)
+    return total / _missing(power, support_radius, spacing, dimension, 0)
 
 
 def lattice_neighbors(support_radius, spacing, dimension):

@@ -24,7 +24,8 @@ class Weights(NamedTuple):
 
     Attributes:
         support_radius: h [m].
-        slope: length of a pair's gradient divided by (1 - r/h) [1/m].
+        power: of the density's weight (1 - r/h)^power.
+        slope: length of a pair's gradient divided by (1 - r/h)^(power - 1) [1/m].
         near_ratio: near gradient per gradient and (1 - r/h) [-].
         virial: nominal pressure that transmits 1 Pa [Pa]: that of the lattice.
         walls: share of the virial that lies in a wall, per share of the density [-].
@@ -32,6 +33,7 @@ class Weights(NamedTuple):
     """
 
     support_radius: float
+    power: int
     slope: float
     near_ratio: float
     virial: float
@@ -51,7 +53,7 @@ def virial_pressures(work, weights, pressures, near_pressures):
     rows, js, us = pair_lists(work.pairs)
     both = pressures[rows] + pressures[js]
     both += weights.near_ratio * us * (near_pressures[rows] + near_pressures[js])
-    arms = weights.slope * us * weights.support_radius * (1.0 - us)
+    arms = weights.slope * us ** (weights.power - 1) * weights.support_radius * (1.0 - us)
     total = np.bincount(rows, weights=arms * both, minlength=len(pressures))
     share = work.contacts.density[:, 0] / np.maximum(work.sums.density, 1e-6)
     share = np.clip(weights.walls * share, 0.0, 0.9)
@@ -60,17 +62,18 @@ def virial_pressures(work, weights, pressures, near_pressures):
 
 
 @lru_cache(maxsize=16)
-def walls_share(support_radius, spacing, dimension):
+def walls_share(power, support_radius, spacing, dimension):
     """Share of the virial in the layers behind a flat wall per share of the density there [-].
 
-    Of the lattice, half a spacing from the wall: sums of (1 - q) r against (1 - q)^2.
+    Of the lattice, half a spacing from the wall: sums of (1 - q)^(power - 1) r against those of
+    (1 - q)^power.
     """
     reach = math.ceil(support_radius / spacing)
     below, whole = np.zeros(2), np.array([0.0, 1.0])
     for offset in itertools.product(range(-reach, reach + 1), repeat=dimension):
         q = math.hypot(*offset) * spacing / support_radius
         if 0.0 < q < 1.0:
-            both = np.array([(1 - q) * q, (1 - q) ** 2])
+            both = np.array([(1 - q) ** (power - 1) * q, (1 - q) ** power])
             whole += both
             below += both * (offset[-1] < 0)
     shares = below / whole

@@ -9,7 +9,7 @@ import numpy as np
 
 from sph_ros.core import tension as pull
 from sph_ros.core.wall_tables import flat_wall
-from sph_ros.core.weights import DENSITY_POWER, POLY6, lattice_sum, radial_weight
+from sph_ros.core.weights import POLY6, SMOOTH_POWER, lattice_sum, radial_weight
 
 #: Of the energy: colour from which on nothing is lacking, and gradients times the spacing that
 #: hardly count. Two layers under a lattice's surface more than the first is there.
@@ -58,7 +58,7 @@ def tension_scales(support_radius, spacing, dimension):
     away = np.linspace(0.0, 0.5 * reach, ROWS)
     walls = flat_wall(away, reach, s, d, mirrored=True, weights=(POLY6,))[:, 0]
     # A lattice's first layer, half a spacing from the wall, has all the energy of adhesion.
-    held = float(flat_wall(0.5 * s, h, s, d, mirrored=True)[0])
+    held = float(flat_wall(0.5 * s, h, s, d, mirrored=True, weights=(SMOOTH_POWER,))[0])
     numbers = (reach, 1.0 / lattice_sum(POLY6, reach, s, d), s, area, cohesion, BLUR, FULL)
     return TensionScales(
         law=pull.Law(*(np.float32(x) for x in numbers)),
@@ -100,11 +100,16 @@ def shares(dimension, ratio):
 def surface_gradient(support_radius, spacing, dimension):
     """Gradient of the density in the outermost layer of a lattice [1/m]."""
     total = math.fsum(
-        DENSITY_POWER * math.sqrt(w) * height * spacing / r / support_radius
-        for w, r, height in _weights(DENSITY_POWER, support_radius, spacing, dimension)
+        SMOOTH_POWER
+        * (1.0 - r / support_radius) ** (SMOOTH_POWER - 1)
+        * height
+        * spacing
+        / r
+        / support_radius
+        for w, r, height in _weights(SMOOTH_POWER, support_radius, spacing, dimension)
         if height > 0
     )
-    return total / lattice_sum(DENSITY_POWER, support_radius, spacing, dimension)
+    return total / lattice_sum(SMOOTH_POWER, support_radius, spacing, dimension)
 
 
 def _weights(weight, support_radius, spacing, dimension):

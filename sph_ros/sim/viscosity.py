@@ -22,7 +22,8 @@ class Rates(NamedTuple):
     """How strongly liquid rubs on itself and on solids in one step.
 
     Attributes:
-        slope: length of a pair's gradient divided by (1 - r/h) [1/m].
+        power: of the density's weight (1 - r/h)^power.
+        slope: length of a pair's gradient divided by (1 - r/h)^(power - 1) [1/m].
         linear: impulse per relative speed [-].
         quadratic: impulse per squared relative speed [s/m].
         neighbors: (1 - r/h) summed over the neighbours in a lattice, by the dimension [-].
@@ -31,6 +32,7 @@ class Rates(NamedTuple):
         inertia: particle mass / time step [kg/s].
     """
 
+    power: int
     slope: float
     linear: float
     quadratic: float
@@ -64,6 +66,7 @@ def apply_viscosity(work, velocities, rates, motion):
             np.float32(0.0 if implicit else rates.linear),
             np.float32(rates.quadratic),
             np.float32(MOST_TAKEN / rates.neighbors),
+            np.float32(rates.power),
             work.scratch,
         )
         velocities[:] = work.scratch
@@ -97,14 +100,16 @@ def apply_viscosity(work, velocities, rates, motion):
 def _solve_implicitly(work, velocities, rates, touching):
     """Conjugate gradients for v - impulses(v) = present v, starting from the present v."""
     direction, image, residual = work.cohesive, work.scratch, work.displacements
-    slope, linear, wall = (np.float32(x) for x in (rates.slope, rates.linear, rates.wall))
+    slope, linear, wall, power = (
+        np.float32(x) for x in (rates.slope, rates.linear, rates.wall, rates.power)
+    )
 
     def dot(a, b):
         relax.chunk_dots(a, b, work.errors)
         return float(work.errors.sum())
 
     def apply(v, moving):
-        relax.viscous_operator(work.pairs, v, slope, linear, image)
+        relax.viscous_operator(work.pairs, v, slope, linear, power, image)
         if touching:
             add_drag(work.contacts, wall, np.float32(moving), v, image)
 
