@@ -30,11 +30,10 @@ def gradients(positions, support_radius, power, lattice_sum):
     return slope[..., None] * offset / r[..., None]
 
 
-def pressure_displacements(positions, pressures, support_radius, lattice_sum):
+def pressure_displacements(gradients, pressures):
     """-sum over j of (P_i + P_j) grad w_ij, (N, 3); pressures scaled [m^2]."""
-    g = gradients(positions, support_radius, 2, lattice_sum)
     both = pressures[:, None].astype(np.float64) + pressures[None]
-    return -(both[..., None] * g).sum(axis=1)
+    return -(both[..., None] * gradients).sum(axis=1)
 
 
 class Mueller:

@@ -18,8 +18,10 @@ from sph_ros.core.weights import lattice_sum
 from sph_ros.sim.state import Workspace, make_grid
 
 H = np.float32(0.02)
-FULL = lattice_sum(2, 0.02, 0.01, 3)
-NEAR_FULL = lattice_sum(3, 0.02, 0.01, 3)
+FULL = {power: lattice_sum(power, 0.02, 0.01, 3) for power in (2, 3)}
+
+#: Weights of the density: that of Clavet et al. and that of `incompressible`.
+both_powers = pytest.mark.parametrize("power", [2, 3])
 
 
 def cloud(name, count=400, seed=0):
@@ -39,7 +41,7 @@ def cloud(name, count=400, seed=0):
     return points.astype(np.float32)
 
 
-def searched(points):
+def searched(points, power=2):
     """Sorted positions, the work arrays with lists and sums, and the sort order."""
     work = Workspace(len(points), 0, pairs_per_particle=8)
     lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
@@ -53,8 +55,9 @@ def searched(points):
     search.sum_densities(
         work.columns,
         H,
-        np.float32(1 / FULL),
-        np.float32(1 / NEAR_FULL),
+        np.float32(power),
+        np.float32(1 / FULL[power]),
+        np.float32(1 / FULL[3]),
         work.contacts.density,
         work.chunks,
         work.pairs,
@@ -86,23 +89,24 @@ def test_lists_are_those_of_all_pairs(name):
         assert set(found) == set(np.nonzero(near[i])[0])
 
 
+@both_powers
 @pytest.mark.parametrize("name", CLOUDS)
-def test_densities_are_those_of_all_pairs(name):
-    work = searched(cloud(name))
+def test_densities_are_those_of_all_pairs(name, power):
+    work = searched(cloud(name), power)
     x = work.predicted
-    expected = naive.densities(x, float(H), 2, FULL)
+    expected = naive.densities(x, float(H), power, FULL[power])
     np.testing.assert_allclose(work.sums.density, expected, rtol=2e-5)
     np.testing.assert_allclose(
-        work.sums.near_density, naive.densities(x, float(H), 3, NEAR_FULL), rtol=2e-5
+        work.sums.near_density, naive.densities(x, float(H), 3, FULL[3]), rtol=2e-5
     )
-    total = naive.gradients(x, float(H), 2, FULL).sum(axis=1)
+    total = naive.gradients(x, float(H), power, FULL[power]).sum(axis=1)
     scale = np.abs(total).max() + 1.0
     np.testing.assert_allclose(work.sums.gradient / scale, total / scale, atol=2e-5)
 
 
-def iterated(points):
+def iterated(points, power=2):
     """The work arrays after one pressure iteration that takes all of a residual; the guess."""
-    work = searched(points)
+    work = searched(points, power)
     guess = np.random.default_rng(1).uniform(0, 1e-5, len(points)).astype(np.float32)
     pressure.pressure_displacements(
         work.pairs,
@@ -118,7 +122,8 @@ def iterated(points):
         work.displacements,
         work.packed,
         H,
-        np.float32(1 / FULL),
+        np.float32(power),
+        np.float32(1 / FULL[power]),
         work.pairs,
         work.sums.density,
         work.contacts,
@@ -127,8 +132,8 @@ def iterated(points):
         work.residuals,
     )
     velocities = np.random.default_rng(2).normal(0.0, 1.0, (len(points), 3)).astype(np.float32)
-    slope = 2.0 / (FULL * float(H))
-    rates = np.array([slope, 0.02, 0.01, 0.1], np.float32)
+    slope = power / (FULL[power] * float(H))
+    rates = np.array([slope, 0.02, 0.01, 0.1, power], np.float32)
     relax.viscous_impulses(work.pairs, velocities, *rates, work.starts)
     work.scratch[:] = velocities
     corrected(work, guess, work.residuals)
@@ -167,17 +172,20 @@ def corrected(work, guess, residuals):
     work.displacements[:] = moved
 
 
-def test_displacements_are_those_of_all_pairs_and_keep_momentum():
-    work, pressures = iterated(cloud("uniform"))
-    expected = naive.pressure_displacements(work.predicted, pressures, float(H), FULL)
+@both_powers
+def test_displacements_are_those_of_all_pairs_and_keep_momentum(power):
+    work, pressures = iterated(cloud("uniform"), power)
+    slopes = naive.gradients(work.predicted, float(H), power, FULL[power])
+    expected = naive.pressure_displacements(slopes, pressures)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(work.displacements / scale, expected / scale, atol=1e-5)
     moved = np.abs(work.displacements).sum(dtype=np.float64)
     assert np.abs(work.displacements.sum(axis=0, dtype=np.float64)).max() < 1e-6 * moved
 
 
-def test_impulses_are_those_of_all_pairs_and_keep_momentum():
-    work, _ = iterated(cloud("uniform"))
+@both_powers
+def test_impulses_are_those_of_all_pairs_and_keep_momentum(power):
+    work, _ = iterated(cloud("uniform"), power)
     v, changed = work.scratch.astype(np.float64), work.starts.astype(np.float64)
     x = work.predicted.astype(np.float64)
     offset = x[:, None] - x[None]
@@ -187,23 +195,26 @@ def test_impulses_are_those_of_all_pairs_and_keep_momentum():
     u = np.maximum(1.0 - r / float(H), 0.0)
     # Clavet 2005, alg. 5; what approaches has a negative speed of separation.
     speed = -np.einsum("ijk,ijk->ij", v[:, None] - v[None], line)
-    rim = u / (u + 1e-3)  # pairs at the rim of the support count less: no division by zero
+    rim = (u / (u + 1e-3)) ** (
+        power - 1
+    )  # pairs at the rim of the support count less: no division by zero
     share = u * np.minimum(0.02 + 0.01 * np.maximum(speed, 0.0) * rim, 0.1)
     expected = v + np.einsum("ij,ijk->ik", share * speed * rim**2, line)
     np.testing.assert_allclose(changed, expected, atol=2e-5)
     assert np.abs((changed - v).sum(axis=0)).max() < 1e-4
 
 
-def test_an_iteration_sees_the_density_after_the_displacements():
-    work, guess = iterated(cloud("uniform"))
+@both_powers
+def test_an_iteration_sees_the_density_after_the_displacements(power):
+    work, guess = iterated(cloud("uniform"), power)
     x, way = work.predicted.astype(np.float64), work.displacements.astype(np.float64)
-    slopes = naive.gradients(x, float(H), 2, FULL)
+    slopes = naive.gradients(x, float(H), power, FULL[power])
     linear = np.einsum("ijk,ijk->i", slopes, way[:, None] - way[None])
     near = naive.pairs_within(x, float(H))
     ends = x + way
     distance = np.linalg.norm(ends[:, None] - ends[None], axis=2)
-    after = np.where(near, np.maximum(1.0 - distance / float(H), 0.0) ** 2, 0.0)
-    np.testing.assert_allclose(work.targets + linear, after.sum(axis=1) / FULL, atol=2e-4)
+    after = np.where(near, np.maximum(1.0 - distance / float(H), 0.0) ** power, 0.0)
+    np.testing.assert_allclose(work.targets + linear, after.sum(axis=1) / FULL[power], atol=2e-4)
     residual = work.targets - 1.0 + linear
     for residuals in (work.residuals, work.residuals[:0]):  # known beforehand, or to be found
         corrected(work, guess, residuals)
@@ -228,7 +239,7 @@ def test_processors_without_vector_instructions_find_the_same(tmp_path):
     script = (
         "import sph_ros.core.vector as v; v.HAS_COMPRESSING_STORE = v.HAS_GATHER = False\n"
         "import numpy as np, test_neighbors as t\n"
-        "w, _ = t.iterated(t.cloud('uniform'))\n"
+        "w, _ = t.iterated(t.cloud('uniform'), 3)\n"
         "lists = [t.neighbors_of(w.pairs, i) for i in range(400)]\n"
         "sums = w.sums.density, w.sums.gradient, w.displacements, w.starts, w.targets, w.scaled\n"
         f"np.savez(r'{tmp_path / 'other.npz'}', *lists, *sums)\n"
@@ -237,14 +248,14 @@ def test_processors_without_vector_instructions_find_the_same(tmp_path):
     environment = dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), str(folder.parent)])
     subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=300)
-    work, _ = iterated(cloud("uniform"))
+    work, _ = iterated(cloud("uniform"), 3)
     exact = work.sums.density, work.sums.gradient, work.displacements, work.starts
     sums = *exact, work.targets, work.scaled
     with np.load(tmp_path / "other.npz") as other:
         for i in range(400):
             mine = neighbors_of(work.pairs, i)
             np.testing.assert_array_equal(mine, other[f"arr_{i}"])
-        # Packed displacements are off by 2e-6 h at most: times 30 gradients of 2 / (h FULL).
+        # Packed displacements are off by 2e-6 h at most: times 30 gradients of 3 / (h FULL).
         for k, (mine, tolerance) in enumerate(zip(sums, [3e-6] * 4 + [2.4e-5] * 2, strict=True)):
             scale = np.abs(mine).max()
             np.testing.assert_allclose(

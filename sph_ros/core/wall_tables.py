@@ -29,7 +29,14 @@ import math
 
 import numpy as np
 
-from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, POLY6, lattice_sum, radial_weight
+from sph_ros.core.weights import (
+    DENSITY_POWER,
+    NEAR_POWER,
+    POLY6,
+    SMOOTH_POWER,
+    lattice_sum,
+    radial_weight,
+)
 
 #: The two weights that walls are tabulated for: Clavet's, and those of Mueller et al. 2003.
 POWERS = (DENSITY_POWER, NEAR_POWER)
@@ -37,6 +44,11 @@ POLY6_AND_SPIKY = (POLY6, NEAR_POWER)
 
 #: Steps of a table from -h to h; linear interpolation is then wrong by less than 1e-4.
 TABLE_STEPS = 1024
+
+#: Walls act as if they were so many spacings nearer to liquid whose density has the third power in
+#: three dimensions. Flowed liquid lies closer to a wall than the lattice that the shares are made
+#: for: without this its density, counted one spacing from a plane wall, was 1.1 % too large there.
+NEARER = 0.03
 
 # Both integrals of the ratio vanish towards h; from here on the last good ratio is kept.
 _LAST_GOOD_RATIO = 0.95
@@ -219,6 +231,8 @@ class WallTables:
             POWERS.index(weight) if weight in POWERS else column
             for column, weight in enumerate(weights)
         ]
+        smooth = weights[0] == SMOOTH_POWER and dimension == 3
+        self._nearer = NEARER * spacing if smooth else 0.0
         self._index = {}
         self._tables = []
         self._distances = distances(support_radius)
@@ -230,7 +244,7 @@ class WallTables:
     def flat(self, distance, mirrored=True):
         """Share that a flat wall adds at the distances [m], (..., 2)."""
         settings = (self.support_radius, self.spacing, self.dimension)
-        return flat_wall(distance, *settings, mirrored, self.weights)
+        return flat_wall(distance - self._nearer, *settings, mirrored, self.weights)
 
     def ball(self, radius, inverted):
         """Index of the table of a ball (2D: a disc) of this radius [m]."""

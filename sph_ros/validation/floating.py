@@ -28,7 +28,7 @@ def balls(case):
 def _ball(case, share):
     start = DEPTH + RADIUS + 0.012
     sim = case.simulation(
-        spacing=case.pick(0.01, 0.0125),
+        spacing=case.pick(0.008, 0.0125),
         material="water",
         liquid=[block([0, 0, 0], [SIDE, SIDE, DEPTH])],
         solids=[
