@@ -21,9 +21,12 @@ from sph_ros.sim.state import family_of
 class ForcesSolver(LeapfrogSolver):
     """Mueller, Charypar & Gross 2003: forces by weighted sums, leap-frog."""
 
-    WEIGHTS = POLY6_AND_SPIKY
-
     force_reach = 0.0625
+
+    @classmethod
+    def wall_weights(cls, scene):
+        """See `Solver`."""
+        return POLY6_AND_SPIKY
 
     def __init__(self, scene, solids, depth):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""

@@ -3,18 +3,20 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from sph_ros.core import neighbors as search
 from sph_ros.core import pressure as core
 from sph_ros.core import projection as project
-from sph_ros.core.weights import NEAR_POWER, SMOOTH_POWER
+from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, SMOOTH_POWER
 from sph_ros.sim.liquid import initial_length
 from sph_ros.sim.pressure import Goal
 from sph_ros.sim.pressure_solver import PressureSolver
 from sph_ros.sim.scales import (
     MELTING_TIME,
+    density_power,
     expected_speed,
     packing,
     stable_time_step,
@@ -22,14 +24,41 @@ from sph_ros.sim.scales import (
 )
 from sph_ros.sim.surface_tension import SurfaceTension, noticeable, ripple_step
 
-#: Share of the support radius that the fastest expected particle crosses in a step. In a still tank
-#: sqrt(2 p / rho) crosses as much, and now and then an eighth more: `SURGE` has to be larger.
-COURANT = 0.4
 
-#: Share of an excess of density that a step of the longest stable length takes back; shorter ones
-#: take back less, in proportion, since a way that is made in less time is a higher speed. All of it
-#: at once would turn every error of the iteration into velocity.
-CORRECTED = 0.1
+class Pace(NamedTuple):
+    """How far a step may go; see `PACES`.
+
+    Attributes:
+        courant: share of the support radius that the fastest expected particle crosses in a step.
+            In a still tank sqrt(2 p / rho) crosses as much, and now and then an eighth more.
+        surge: share of the support radius that sqrt(2 p / rho) crosses in a substep, with p the
+            pressure that all but `PEAKS` of the particles stay below. A pressure is stiff against
+            shear like p / h^2; particles that are pushed, not dropped, have one that their speed
+            says nothing about.
+        corrected: share of an excess of density that a step of the longest stable length takes
+            back; shorter ones take back less, in proportion, since a way that is made in less time
+            is a higher speed. All of it at once would turn every error of the iteration into
+            velocity.
+        calming: kinematic viscosity that the lattice needs to stay calm, per spacing and expected
+            speed. Nothing else damps a symplectic step. Liquids that are thicker by themselves get
+            none of it.
+    """
+
+    courant: float
+    surge: float
+    corrected: float
+    calming: float
+
+
+#: By the power of the density's weight. With the third one a tank boils from a surge of 0.55 on,
+#: and goes on boiling once it does; no shear strength damps it.
+PACES = {
+    DENSITY_POWER: Pace(courant=0.53, surge=0.7, corrected=0.4, calming=0.005),
+    SMOOTH_POWER: Pace(courant=0.4, surge=0.5, corrected=0.1, calming=0.002),
+}
+
+#: Share of the particles whose pressures do not count for the length of a step.
+PEAKS = 0.005
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
@@ -37,36 +66,31 @@ ERROR_SHARE, CALM = 0.4, 0.05
 
 #: Largest mean density error after a step, as a share of (h / L)^2 with L the depth of the liquid
 #: (where there is no gravity its length). An error e that is as long as the liquid is paid back by
-#: a pressure of about rho e (L / (pi dt))^2. It is stable up to rho (h / dt)^2 / 4 (`SURGE`), so
+#: a pressure of about rho e (L / (pi dt))^2. It is stable up to rho (h / dt)^2 / 4, so
 #: the finer the liquid is resolved the less error it stands, however short the step.
 STEEPEST = 1.0
-
-#: Share of the support radius that sqrt(2 p / rho) crosses in a substep, with p the pressure that
-#: all but `PEAKS` of the particles stay below. A pressure is stiff against shear like p / h^2;
-#: particles that are pushed, not dropped, have one that their speed says nothing about.
-SURGE, PEAKS = 0.5, 0.005
 
 #: Particles below this density, or pressed by less than a layer's weight, are at a free surface;
 #: there is one if so many are [-].
 SURFACE_DENSITY, SURFACE_SHARE = 0.85, 0.01
 
-#: Kinematic viscosity that the lattice needs to stay calm, per spacing and expected speed [-].
-#: Nothing else damps a symplectic step. Liquids that are thicker by themselves get none of it.
-LATTICE_VISCOSITY = 0.002
-
 
 class IncompressibleSolver(PressureSolver):
     """Pressures that hold the density of the next positions; see `core.projection`."""
 
-    WEIGHTS = (SMOOTH_POWER, NEAR_POWER)
-    courant = COURANT
-
     def __init__(self, scene, solids, depth):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
+        self._pace = PACES[density_power(scene)]
+        self.courant = self._pace.courant
         super().__init__(scene, solids, depth)
         self._pressed = 0.0
         length = depth or initial_length(scene)
         self._most_error = STEEPEST * (scene.support_radius / max(length, 1e-9)) ** 2
+
+    @classmethod
+    def wall_weights(cls, scene):
+        """See `Solver`."""
+        return density_power(scene), NEAR_POWER
 
     def stable_time_step(self):
         """A step that keeps the scene stable [s], and what bounds it."""
@@ -81,7 +105,7 @@ class IncompressibleSolver(PressureSolver):
     def longest_step(self):
         """The longest substep [s] that the present pressures allow."""
         speed = math.sqrt(2.0 * self._pressed / self.scales.rest_density)
-        return SURGE * float(self._h) / speed if speed > 0.0 else math.inf
+        return self._pace.surge * float(self._h) / speed if speed > 0.0 else math.inf
 
     def state(self):
         """What a later step depends on beside the fluid, for a snapshot."""
@@ -96,12 +120,14 @@ class IncompressibleSolver(PressureSolver):
         """Use another material from the next substep on."""
         super().set_material(material)
         scene = self._scene
-        kinematic = LATTICE_VISCOSITY * scene.spacing * expected_speed(scene, self._depth)
+        kinematic = self._pace.calming * scene.spacing * expected_speed(scene, self._depth)
         least = viscous_rate(kinematic, scene)
         self.scales = dataclasses.replace(
             self.scales, viscous_rate=max(self.scales.viscous_rate, least), cohesion=0.0, near=0.0
         )
-        self._surface = SurfaceTension(scene) if noticeable(material, scene) else None
+        self._surface = None
+        if noticeable(material, scene):
+            self._surface = SurfaceTension(scene, density_power(scene))
 
     def step(self, fluid, time, time_step):
         """Advance `fluid` by one substep; the solids' motion must already be set.
@@ -252,7 +278,7 @@ class IncompressibleSolver(PressureSolver):
             work.pairs,
             work.sums.density,
             work.contacts,
-            np.float32(CORRECTED * pace),
+            np.float32(self._pace.corrected * pace),
             np.float32(pace),
             dt,
             work.targets,

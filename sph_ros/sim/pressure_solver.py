@@ -31,7 +31,7 @@ class PressureSolver(Solver):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""
         super().__init__(scene, solids, depth)
         self._packing = packing(scene, 0.0)
-        self._power = density_power(scene.solver)
+        self._power = density_power(scene)
         self._most_share = jacobi_share(
             scene.support_radius, scene.spacing, scene.dimension, self._power
         )

@@ -42,24 +42,31 @@ from sph_ros.core.weights import (
     lattice_sum,
 )
 from sph_ros.sim.jets import emission_height, make_jet
+from sph_ros.sim.surface_tension import noticeable
 
 #: Near-stiffness per cohesive stiffness (b above). More, and a drop freezes into a lattice; none,
 #: and its particles clump.
 NEAR_SHARE = 0.3
 
 #: Density of flowed liquid on the lattice's scale, where both have the same volume, over h /
-#: spacing; by solver and dimension. Measured by benchmarks/calibrate_packing.py. At the usual ratio
-#: 2 in three dimensions the level alone would say 0.967 for `incompressible`, but then the corners
-#: of a box are 4.5 % too dense; with 0.954 they are within 3 %, and the level is 1.5 % too high.
+#: spacing; by solver and dimension. Measured by benchmarks/calibrate_packing.py.
 FLOWED_SHARE = {
     "relaxation": {
         2: ((1.6, 0.991), (2.0, 0.970), (2.5, 0.966), (3.0, 0.947)),
         3: ((1.6, 0.988), (2.0, 0.952), (2.5, 0.959), (3.0, 0.990)),
     },
+    # Of the third power. Of the second one, where surface tension acts: `TENSE_SHARE`.
     "incompressible": {
         2: ((1.6, 1.000), (2.0, 0.996), (2.5, 0.995), (3.0, 0.988)),
         3: ((1.6, 0.992), (2.0, 0.995), (2.5, 0.989), (3.0, 0.977)),
     },
+}
+
+#: At the usual ratio 2 in three dimensions the level alone would say 0.967, but then the corners of
+#: a box are 4.5 % too dense; with 0.954 they are within 3 %, and the level is 1.5 % too high.
+TENSE_SHARE = {
+    2: ((1.6, 0.999), (2.0, 0.995), (2.5, 0.992), (3.0, 0.982)),
+    3: ((1.6, 1.000), (2.0, 0.954), (2.5, 0.982), (3.0, 0.971)),
 }
 
 #: Time in which the lattice at the start becomes liquid [s].
@@ -105,14 +112,23 @@ class Scales:
     elasticity: float
 
 
-def density_power(solver):
-    """Power of the weight of the density."""
-    return SMOOTH_POWER if solver == "incompressible" else DENSITY_POWER
+def density_power(scene):
+    """Power of the density's weight in a scene.
+
+    A drop whose density has the third power swings a third too slowly when it is six spacings in
+    radius, whatever the numbers of its surface tension are. So liquids whose surface tension acts
+    keep the second one.
+    """
+    if scene.solver != "incompressible" or noticeable(scene.material, scene):
+        return DENSITY_POWER
+    return SMOOTH_POWER
 
 
 def packing(scene, time):
     """Rest density of the lattice over that of the liquid at a time [s] after the start [-]."""
-    ratios, shares = zip(*FLOWED_SHARE[scene.solver][scene.dimension], strict=True)
+    tense = scene.solver == "incompressible" and density_power(scene) == DENSITY_POWER
+    table = TENSE_SHARE if tense else FLOWED_SHARE[scene.solver]
+    ratios, shares = zip(*table[scene.dimension], strict=True)
     share = float(np.interp(scene.support_radius / scene.spacing, ratios, shares))
     return 1.0 / (1.0 - (1.0 - share) * min(time / MELTING_TIME, 1.0))
 
@@ -140,7 +156,7 @@ def solver_scales(material, scene, depth):
     """The solver's numbers for `material` in `scene` with liquid `depth` [m] deep."""
     h, s, d = scene.support_radius, scene.spacing, scene.dimension
     g = math.sqrt(sum(c * c for c in scene.gravity))
-    power = density_power(scene.solver)
+    power = density_power(scene)
     virial = gradient_sum(power, h, s, d)
     near_virial = gradient_sum(NEAR_POWER, h, s, d)
     cohesion = material.surface_tension / surface_energy(h, s, d)

@@ -58,7 +58,9 @@ class Simulation:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         ensure_compiled(needs(self.scene))
         self.material = self.scene.material
-        self._solids = Solids(self.scene, SOLVER_CLASSES[self.scene.solver].WEIGHTS)
+        self._solids = Solids(
+            self.scene, SOLVER_CLASSES[self.scene.solver].wall_weights(self.scene)
+        )
         self._start()
 
     def _start(self):

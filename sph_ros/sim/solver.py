@@ -32,8 +32,10 @@ class Solver:
         timings: milliseconds of the last step by part.
     """
 
-    #: Weights that walls act with.
-    WEIGHTS = POWERS
+    @classmethod
+    def wall_weights(cls, scene):
+        """The two weights that walls act with in a scene."""
+        return POWERS
 
     def __init__(self, scene, solids, depth):
         """Args: the scene, its `Solids`, depth of the liquid at rest [m]."""

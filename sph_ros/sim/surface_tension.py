@@ -9,7 +9,7 @@ import numpy as np
 
 from sph_ros.core import tension as pull
 from sph_ros.core.wall_tables import flat_wall
-from sph_ros.core.weights import POLY6, SMOOTH_POWER, lattice_sum, radial_weight
+from sph_ros.core.weights import DENSITY_POWER, POLY6, lattice_sum, radial_weight
 
 #: Of the energy: colour from which on nothing is lacking, and gradients times the spacing that
 #: hardly count. Two layers under a lattice's surface more than the first is there.
@@ -50,20 +50,27 @@ class TensionScales:
     walls: np.ndarray
 
 
-def tension_scales(support_radius, spacing, dimension):
-    """Numbers of the surface tension at one spacing, `TensionScales`."""
+def tension_scales(support_radius, spacing, dimension, power=DENSITY_POWER):
+    """Numbers of the surface tension at one spacing, `TensionScales`.
+
+    Args:
+        support_radius: h [m].
+        spacing: [m].
+        dimension: 2 or 3.
+        power: of the density's weight (1 - r/h)^power.
+    """
     h, s, d = support_radius, spacing, dimension
     reach = pull.CELLS * h
     area, cohesion = shares(d, h / s)
     away = np.linspace(0.0, 0.5 * reach, ROWS)
     walls = flat_wall(away, reach, s, d, mirrored=True, weights=(POLY6,))[:, 0]
     # A lattice's first layer, half a spacing from the wall, has all the energy of adhesion.
-    held = float(flat_wall(0.5 * s, h, s, d, mirrored=True, weights=(SMOOTH_POWER,))[0])
+    held = float(flat_wall(0.5 * s, h, s, d, mirrored=True, weights=(power,))[0])
     numbers = (reach, 1.0 / lattice_sum(POLY6, reach, s, d), s, area, cohesion, BLUR, FULL)
     return TensionScales(
         law=pull.Law(*(np.float32(x) for x in numbers)),
         hold=1.0 / (s * held),
-        mark=MARK * surface_gradient(h, s, d),
+        mark=MARK * surface_gradient(power, h, s, d),
         walls=walls.astype(np.float32),
     )
 
@@ -97,19 +104,14 @@ def shares(dimension, ratio):
     return tuple(float(np.interp(ratio, ratios, column)) for column in columns)
 
 
-def surface_gradient(support_radius, spacing, dimension):
+def surface_gradient(power, support_radius, spacing, dimension):
     """Gradient of the density in the outermost layer of a lattice [1/m]."""
     total = math.fsum(
-        SMOOTH_POWER
-        * (1.0 - r / support_radius) ** (SMOOTH_POWER - 1)
-        * height
-        * spacing
-        / r
-        / support_radius
-        for w, r, height in _weights(SMOOTH_POWER, support_radius, spacing, dimension)
+        power * (1.0 - r / support_radius) ** (power - 1) * height * spacing / r / support_radius
+        for w, r, height in _weights(power, support_radius, spacing, dimension)
         if height > 0
     )
-    return total / lattice_sum(SMOOTH_POWER, support_radius, spacing, dimension)
+    return total / lattice_sum(power, support_radius, spacing, dimension)
 
 
 def _weights(weight, support_radius, spacing, dimension):
@@ -124,9 +126,9 @@ def _weights(weight, support_radius, spacing, dimension):
 class SurfaceTension:
     """The passes, with memory for what they find."""
 
-    def __init__(self, scene):
-        """Args: the scene."""
-        self.scales = tension_scales(scene.support_radius, scene.spacing, scene.dimension)
+    def __init__(self, scene, power):
+        """Args: the scene, power of the density's weight."""
+        self.scales = tension_scales(scene.support_radius, scene.spacing, scene.dimension, power)
         self._fit(0)
 
     def _fit(self, count):
