@@ -54,7 +54,7 @@ class Pace(NamedTuple):
 #: and goes on boiling once it does; no shear strength damps it.
 PACES = {
     DENSITY_POWER: Pace(courant=0.53, surge=0.7, corrected=0.4, calming=0.005),
-    SMOOTH_POWER: Pace(courant=0.4, surge=0.5, corrected=0.1, calming=0.002),
+    SMOOTH_POWER: Pace(courant=0.4, surge=0.5, corrected=0.2, calming=0.005),
 }
 
 #: Share of the particles whose pressures do not count for the length of a step.
