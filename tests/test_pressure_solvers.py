@@ -191,8 +191,8 @@ def test_a_resting_column_rests_keeps_its_volume_and_weighs_what_it_should(solve
     assert np.mean(weight) == pytest.approx(mass * 9.81, rel=0.02)
     x = sim.positions
     assert np.percentile(x[:, 2], 99.5) == pytest.approx(0.195, abs=0.008)
-    # No gap and no crowd at the walls: as many particles in each vertical quarter, but for the layer
-    # that lies on both sides of its end.
+    # No gap and no crowd at the walls: as many particles in each vertical quarter, but for layers
+    # that lie on both sides of its end.
     quarters = np.histogram(x[:, 0], bins=4, range=(0.0, 0.1))[0] / len(x)
     assert np.abs(quarters - 0.25).max() < 0.03
 
@@ -203,8 +203,8 @@ def test_pressure_grows_with_depth(solver):
     slopes = []
     for _ in range(20):
         sim.step()
-        pressure = sim._fluid.pressures
-        depth = 0.2 - sim._fluid.positions[:, 2]
+        pressure = sim.pressures
+        depth = 0.2 - sim.positions[:, 2]
         inner = (depth > 0.04) & (depth < 0.16)
         slopes.append(np.polyfit(depth[inner], pressure[inner], 1)[0])
     assert np.mean(slopes) == pytest.approx(1000.0 * 9.81, rel=0.1)
