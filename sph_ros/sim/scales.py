@@ -69,8 +69,8 @@ TENSE_SHARE = {
     3: ((1.6, 1.000), (2.0, 0.954), (2.5, 0.982), (3.0, 0.971)),
 }
 
-#: Support in spacings below which the third power has too few neighbours: liquid that a solid hits at
-#: 3 m/s then leaves it at 8.
+#: Support in spacings below which the third power has too few neighbours: liquid that a solid hits
+#: at 3 m/s then leaves it at 8.
 LEAST_SMOOTH = 1.8
 
 #: Time in which the lattice at the start becomes liquid [s].
