@@ -153,7 +153,9 @@ def quaternions(rotation_vectors: np.ndarray) -> np.ndarray:
 def hand_motion(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Stamps (N,), times of receipt (N,) [ns] from the start; positions (N, 3), quats (N, 4)."""
     rng = np.random.default_rng(recording.seed)
-    duration = sum(part[0] for part in recording.parts)
+    duration = 0.0
+    for part in recording.parts:  # sum() adds floats in another way from Python 3.12 on
+        duration += part[0]
     times = np.arange(int(duration * RATE)) / RATE
     times[1:] += rng.uniform(-0.002, 0.002, len(times) - 1)
     delays = rng.uniform(0.002, 0.006, len(times))
