@@ -1,14 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The liquid's surface in a thread of its own, beside the stepping. The newest state wins."""
 
-import os
-import sys
 import threading
 import time
-
-#: A step waits for the slowest of its threads, and each has a processor of its own to itself only
-#: as long as nobody else wants it. Surfaces take what steps leave.
-NICENESS = 5
 
 
 class SurfaceWorker:
@@ -58,8 +52,6 @@ class SurfaceWorker:
         self.milliseconds = (time.perf_counter() - begin) * 1e3
 
     def _run(self):
-        if sys.platform == "linux":  # where this is the thread's, not the process's
-            os.nice(NICENESS)
         while True:
             with self._wake:
                 self._wake.wait_for(lambda: self._stopping or self._job is not None)
