@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import sph_ros
+from sph_ros.sim.abilities import LIQUID_SOLVERS, SOLVERS
 from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.materials import MATERIALS, RANGES
-from sph_ros.sim.scene_types import LIQUID_SOLVERS, SOLVERS
 
 TANK = {
     "spacing": 0.02,

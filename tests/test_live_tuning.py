@@ -72,6 +72,7 @@ def test_density_follows_its_parameter(tuner, scene):
             break
     assert len(halved) > 0.45 * len(ratios)
     assert np.median(halved) == pytest.approx(0.5, rel=0.1)
-    for name in ("viscosity", "surface_tension", "elasticity"):
+    tuner.set("material.gyration_radius", 0.02)
+    for name in ("viscosity", "surface_tension", "elasticity", "gyration_radius"):
         tuner.set(f"material.{name}", 0.5 * tuner.number(f"material.{name}"))
     assert tuner.step()

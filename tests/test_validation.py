@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sph_ros.cli import main
+from sph_ros.sim.abilities import LIQUID_SOLVERS
 from sph_ros.sim.guards import UnstableError
-from sph_ros.sim.scene_types import LIQUID_SOLVERS
 from sph_ros.validation import checks, dam_break, floating
 from sph_ros.validation.case import Case, NotAvailableError
 from sph_ros.validation.drops import sphericity

@@ -27,6 +27,10 @@ MATERIAL_TEXTS = {
     "wall_friction": "0 lets the liquid slip along solids, 1 drags it with them [-]",
     "adhesion": "how strongly solids hold the liquid, as a share of its own cohesion [-]",
     "quadratic_viscosity": "damps pairs that collide fast (Clavet's beta times the spacing) [-]",
+    "elasticity": "shear modulus of springs between neighbours; 0: a liquid [Pa]",
+    "yield_strain": "relative deformation that springs spring back from [-]",
+    "plasticity": "rate at which springs give way beyond that [1/s]",
+    "gyration_radius": "flywheels that let vortices up to this radius live longer; 0: none [m]",
 }
 
 

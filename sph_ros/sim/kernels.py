@@ -21,7 +21,7 @@ from numba import config
 from numba.core import caching, event
 
 from sph_ros.core.jit import KERNELS
-from sph_ros.sim.scene_types import LIQUID_SOLVERS, SOLVERS
+from sph_ros.sim.abilities import LIQUID_SOLVERS, SOLVERS, SPIN_SOLVERS
 from sph_ros.sim.shape_types import Mesh, OpenSurface
 
 #: Set for the children, which must not have children of their own.
@@ -30,7 +30,10 @@ COMPILING = "SPH_ROS_COMPILING"
 LONGEST = 900.0  # [s]
 
 #: What scenes may have beside a solver; each has kernels of its own.
-FEATURES = ("bodies", "sheets", "meshes", "springs")
+FEATURES = ("bodies", "sheets", "meshes", "springs", "spins")
+
+#: Those that a material may have -> its solvers.
+MATERIAL_FEATURES = {"springs": LIQUID_SOLVERS, "spins": SPIN_SOLVERS}
 
 #: Functions that the first scene of all needs, about: for reports of progress.
 FUNCTIONS = 200
@@ -63,6 +66,8 @@ _BODY = {
     "density": 500.0,
 }
 
+_MATERIALS = {"springs": "cream", "spins": {"base": "honey", "gyration_radius": 0.1}}
+
 #: A triangle in the middle of the liquid, and a tetrahedron above it.
 _SHEET = "v 0 0 0.05\nv 0.1 0 0.05\nv 0 0.1 0.05\nf 1 2 3"
 _MESH = (
@@ -86,10 +91,23 @@ def needs(scene):
     has = {
         "bodies": any(solid.control == "free" for solid in scene.solids),
         "sheets": any(isinstance(shape, OpenSurface) for shape in shapes),
-        "springs": scene.material.elasticity > 0.0 and scene.solver in LIQUID_SOLVERS,
         "meshes": any(_contains_mesh(shape) for shape in drawn),
     }
-    return [scene.solver, *(f"{scene.solver}+{name}" for name in FEATURES if has[name])]
+    return [
+        scene.solver,
+        *(f"{scene.solver}+{name}" for name, needed in has.items() if needed),
+        *needs_of_material(scene.material, scene.solver),
+    ]
+
+
+def needs_of_material(material, solver):
+    """Names of what has to be compiled for a material beside what all need."""
+    has = {"springs": material.elasticity > 0.0, "spins": material.gyration_radius > 0.0}
+    return [
+        f"{solver}+{name}"
+        for name, solvers in MATERIAL_FEATURES.items()
+        if has[name] and solver in solvers
+    ]
 
 
 def _contains_mesh(shape):
@@ -102,7 +120,7 @@ def everything():
     pairs = itertools.product(SOLVERS, FEATURES)
     return [
         *SOLVERS,
-        *(f"{s}+{name}" for s, name in pairs if name != "springs" or s in LIQUID_SOLVERS),
+        *(f"{s}+{name}" for s, name in pairs if s in MATERIAL_FEATURES.get(name, SOLVERS)),
     ]
 
 
@@ -255,8 +273,8 @@ def main(names):
                 solids[feature] = [*_SOLIDS, {"name": "mesh", **shape}]
             for dimension in (3,) if feature == "sheets" else (3, 2):
                 scene = {**_SCENE, "solver": solver, "solids": solids.get(feature, _SOLIDS)}
-                if feature == "springs":
-                    scene["material"] = "cream"
+                if feature in _MATERIALS:
+                    scene["material"] = _MATERIALS[feature]
                 _take_every_way(scene, dimension)
         if not feature.startswith("-"):
             _mark(name).touch()

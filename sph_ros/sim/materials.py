@@ -24,6 +24,8 @@ class Material:
         elasticity: shear modulus of springs between neighbours; 0: a liquid [Pa].
         yield_strain: relative deformation that springs spring back from [-].
         plasticity: rate at which they give way beyond that [1/s].
+        gyration_radius: of flywheels that the particles are (a micropolar liquid, Eringen 1966):
+            a vortex of radius a lives 1 + (R / a)^2 times as long; 0: none [m].
         color: red, green, blue, 0 to 1, of a liquid that is drawn opaque; None: clear as water.
     """
 
@@ -38,6 +40,7 @@ class Material:
     elasticity: float = quantity("Pa", 0.0, low=0.0, high=1e5)
     yield_strain: float = quantity("1", 0.1, low=0.0, high=10.0)
     plasticity: float = quantity("1/s", 0.0, low=0.0, high=1e4)
+    gyration_radius: float = quantity("m", 0.0, low=0.0, high=1.0)
     color: Vector | None = quantity("1", None, low=0.0, high=1.0)
 
     def __post_init__(self):

@@ -11,6 +11,7 @@ from sph_ros.sim.coupling import Coupling
 from sph_ros.sim.pressure import UNKNOWN, jacobi_share, solve_pressures
 from sph_ros.sim.scales import density_power, packing, solver_scales, stable_time_step
 from sph_ros.sim.solver import Solver
+from sph_ros.sim.spins import turn_liquid
 from sph_ros.sim.stress import Weights, virial_pressures, walls_share
 from sph_ros.sim.viscosity import Rates, apply_viscosity
 
@@ -211,3 +212,12 @@ class PressureSolver(Solver):
                 fluid.velocities, rates.wall, rates.wall_quadratic, self.scales.mass
             )
         apply_viscosity(self._work, fluid.velocities, rates, self._solids.motion)
+        self._turn(fluid, time_step)
+
+    def _turn(self, fluid, time_step):
+        """Flywheels that let vortices live longer, where the liquid has them."""
+        radius = self._material.gyration_radius
+        longest, _ = self.stable_time_step() if radius > 0.0 else (time_step, "")
+        scale = self.scales.density_scale * self._packing
+        steps = time_step / longest
+        turn_liquid(fluid, self._work, self._scene, self._power, scale, radius, steps)

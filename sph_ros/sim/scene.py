@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sph_ros.sim.abilities import SOLVERS
 from sph_ros.sim.jets import ENDLESS, capacity, make_jet
 from sph_ros.sim.kernels import ensure_compiled, needs
 from sph_ros.sim.liquid import (
@@ -21,7 +22,7 @@ from sph_ros.sim.liquid import (
 )
 from sph_ros.sim.mass import mass_properties
 from sph_ros.sim.materials import MATERIALS, Material
-from sph_ros.sim.scene_types import SOLVERS, Emitter, Keyframe, LiquidBlock, Scene, Sink, SolidSpec
+from sph_ros.sim.scene_types import Emitter, Keyframe, LiquidBlock, Scene, Sink, SolidSpec
 from sph_ros.sim.scene_yaml import Node, SceneError, build, check_keys, nearest, read_dict
 from sph_ros.sim.scene_yaml import read_file as read_yaml
 from sph_ros.sim.shapes import (

@@ -8,6 +8,7 @@ import math
 import re
 from dataclasses import dataclass, replace
 
+from sph_ros.sim.abilities import MIXING_SOLVERS, SOLVERS, alike, faults
 from sph_ros.sim.materials import Material
 from sph_ros.sim.quantities import (
     Quaternion,
@@ -28,15 +29,6 @@ from sph_ros.sim.shapes import (
     Shape,
     Sphere,
 )
-
-#: Names of the solvers (`sim.solvers` says what they are).
-SOLVERS = ("relaxation", "incompressible", "forces", "lennard_jones", "none")
-
-#: Those that know more than one liquid.
-MIXING_SOLVERS = ("forces", "lennard_jones", "none")
-
-#: Those that make particles one liquid, with a density to hold; they know springs, too.
-LIQUID_SOLVERS = ("relaxation", "incompressible", "forces")
 
 #: A particle's liquid is one byte.
 MOST_LIQUIDS = 16
@@ -372,9 +364,8 @@ class Scene:
                     f"liquid[{index}].material: {other.name!r} beside {self.material.name!r}, and "
                     f"solver {self.solver!r} knows one material; {MIXING_SOLVERS} know several"
                 )
-        fault = spring_fault(self, self.liquids)
-        if fault:
-            raise ValueError(f"material.elasticity: {fault}")
+        for field, fault in faults(self, self.liquids):
+            raise ValueError(f"material.{field}: {fault}")
         if len(self.liquids) > MOST_LIQUIDS:
             raise ValueError(f"liquid: expected at most {MOST_LIQUIDS} liquids of different looks")
 
@@ -384,26 +375,3 @@ class Scene:
             if solid.name in seen:
                 raise ValueError(f"solids[{index}].name: {solid.name!r} is the name of two solids")
             seen.add(solid.name)
-
-
-def alike(one, other):
-    """Whether two materials differ in name and color at most."""
-    return replace(one, name=other.name, color=other.color) == other
-
-
-def spring_fault(scene, materials):
-    """Why springs cannot be, in words; None where they can, or are not asked for.
-
-    Args:
-        scene: for its solver.
-        materials: of all its liquids.
-    """
-    elastic = next((material for material in materials if material.elasticity > 0.0), None)
-    if elastic is None:
-        return None
-    given = f"got {elastic.elasticity:g} Pa of {elastic.name!r}"
-    if scene.solver not in LIQUID_SOLVERS:
-        return f"expected 0, because solver {scene.solver!r} knows no springs; {given}"
-    if not all(alike(material, elastic) for material in materials):
-        return f"expected 0 where several liquids meet, {given}"
-    return None

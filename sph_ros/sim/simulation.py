@@ -8,15 +8,16 @@ import numpy as np
 
 from sph_ros.core.neighbors import bounding_box
 from sph_ros.core.surface import extract_surface
+from sph_ros.sim.abilities import alike, faults
 from sph_ros.sim.emitters import Emitters
 from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
 from sph_ros.sim.jets import capacity
-from sph_ros.sim.kernels import ensure_compiled, needs
+from sph_ros.sim.kernels import ensure_compiled, needs, needs_of_material
 from sph_ros.sim.liquid import families, fill_blocks
 from sph_ros.sim.materials import changed
 from sph_ros.sim.scales import scene_depth
 from sph_ros.sim.scene import load_scene
-from sph_ros.sim.scene_types import Scene, alike, spring_fault
+from sph_ros.sim.scene_types import Scene
 from sph_ros.sim.shapes import Container
 from sph_ros.sim.sinks import Sinks
 from sph_ros.sim.snapshots import read_snapshot, write_snapshot
@@ -96,12 +97,10 @@ class Simulation:
         self.material = material
         used, self.notes = tamed(material, self.scene, self._stable_step_of)
         others = [other for other in self.scene.liquids if not alike(other, self.scene.material)]
-        fault = spring_fault(self.scene, [material, *others])
-        if fault:
-            used = dataclasses.replace(used, elasticity=0.0)
-            self.notes.append(f"elasticity: {fault}; there are no springs")
-        elif material.elasticity > 0.0:
-            ensure_compiled([f"{self.scene.solver}+springs"])
+        for field, fault in faults(self.scene, [material, *others]):
+            used = dataclasses.replace(used, **{field: 0.0})
+            self.notes.append(f"{field}: {fault}; 0 is used")
+        ensure_compiled(needs_of_material(used, self.scene.solver))
         self._stable_step, _ = self._stable_step_of(used)
 
     def _stable_step_of(self, material):

@@ -10,9 +10,9 @@ from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import sheet_contacts as sheets
 from sph_ros.core.wall_tables import POWERS
+from sph_ros.sim.abilities import alike
 from sph_ros.sim.guards import UnstableError
 from sph_ros.sim.scales import viscous_rate
-from sph_ros.sim.scene_types import alike
 from sph_ros.sim.springs import Springs
 from sph_ros.sim.state import Workspace, family_of, make_grid
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sph_ros.sim.scene_types import LIQUID_SOLVERS
+from sph_ros.sim.abilities import LIQUID_SOLVERS
 from sph_ros.validation.checks import (
     CHECKS,
     chosen,
