@@ -58,8 +58,7 @@ def test_momentum_goes_back_and_forth_between_liquid_and_body(solver):
             "spacing": 0.02,
             "solver": solver,
             "gravity": [0, 0, 0],
-            # Where a surface ends on a wall its tension turns the liquid, and nothing the wall.
-            "material": {"base": "water", "viscosity": 0.1, "surface_tension": 0.0},
+            "material": {"base": "water", "viscosity": 0.1},
             "liquid": [{"box": {"size": [0.2, 0.2, 0.2]}, "velocity": [0, 0.3, 0]}],
             "solids": [
                 {

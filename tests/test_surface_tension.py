@@ -126,3 +126,38 @@ def test_tension_that_gravity_hides_is_left_out():
     assert noticeable(water, scene(0.49 * h)) and not noticeable(water, scene(0.51 * h))
     assert noticeable(water, scene(0.05, g=0.0))
     assert not noticeable(MATERIALS["air_like"], scene(0.001, g=0.0))
+
+
+@pytest.mark.parametrize("adhesion", [0.1, 0.9])
+def test_a_wall_bears_the_torque_that_its_surface_tension_has_on_the_liquid(adhesion):
+    """About the world's origin; solids' torques are about theirs at the end of the step."""
+    cube = {"name": "cube", "box": {"size": [0.006] * 3}, "control": "free", "density": 500.0}
+    cube["pose"] = {"position": [0.009, 0.002, 0.001], "quat_xyzw": [0.1, 0.2, 0, 1]}
+    sim = sph_ros.Simulation(
+        {
+            "spacing": S,
+            "solver": "incompressible",
+            "gravity": [0, 0, 0],
+            "material": {"base": "water", "adhesion": adhesion},
+            "liquid": [{"box": {"size": [0.01] * 3}}],
+            "solids": [cube],
+        }
+    )
+    surface = sim._solver._surface
+    displace, found = surface.displace, []
+
+    def watched(work, grid, motion, material, mass, time_step):
+        before = work.reactions.sum(axis=0)[0]
+        displace(work, grid, motion, material, mass, time_step)
+        wrench = work.reactions.sum(axis=0)[0] - before
+        forces = work.cohesive.astype(float) * mass / time_step**2
+        liquid = np.cross(work.predicted.astype(float), forces).sum(axis=0)
+        solid = wrench[3:] + np.cross(motion.position[0].astype(float), wrench[:3])
+        found.append((liquid, solid))
+
+    surface.displace = watched
+    for _ in range(20):
+        sim.step()
+    liquid, solid = np.array(found).transpose(1, 0, 2)
+    assert np.abs(liquid).max() > 1e-9
+    assert np.abs(liquid + solid).max() < 1e-4 * np.abs(liquid).max()

@@ -63,12 +63,16 @@ class Pulls(NamedTuple):
         by_colour: de/dc [-], (N,).
         by_gradient: de/d grad c [m], (3, N).
         normals: of the walls beside it, (N, 3, 3).
+        walls: the solids that these belong to, -1 for none, (N, 3) int32.
+        along: parts of grad c along the normals that the walls took off [1/m], (N, 3).
     """
 
     colour: np.ndarray
     by_colour: np.ndarray
     by_gradient: np.ndarray
     normals: np.ndarray
+    walls: np.ndarray
+    along: np.ndarray
 
 
 @device
@@ -151,12 +155,13 @@ def add_normal(normals, count, x, y, z):
 
 
 @device
-def add_walls_of(i, j, positions, contacts, walls, reach, normals, count, free):
+def add_walls_of(i, j, positions, contacts, walls, reach, normals, solids, count, free):
     """Add those of the walls that j touches which are new to i; their number, the share free."""
     for row in range(contacts.start[j], contacts.end[j]):
         t = contacts.terms[row]
         more = add_normal(normals, count, t[NORMAL], t[NORMAL + 1], t[NORMAL + 2])
         if more > count:
+            solids[count] = contacts.solid[row]
             distance = t[DISTANCE]
             for axis in range(3):
                 distance += (positions[i, axis] - positions[j, axis]) * t[NORMAL + axis]
@@ -166,21 +171,25 @@ def add_walls_of(i, j, positions, contacts, walls, reach, normals, count, free):
 
 
 @device
-def look_at_walls(i, positions, pairs, contacts, walls, reach, normals):
+def look_at_walls(i, positions, pairs, contacts, walls, reach, normals, solids):
     """Walls beside particle i: those it has contact with, and those its neighbours have.
 
     Contacts are only those that add density, and the reach goes farther.
 
     Args:
-        normals: (3, 3); the first are written.
+        normals, solids: (3, 3) and (3,); the first are written.
 
     Returns:
         Their number, and the share of the surroundings that they leave free [-].
     """
-    count, free = add_walls_of(i, i, positions, contacts, walls, reach, normals, 0, np.float32(1.0))
+    count, free = add_walls_of(
+        i, i, positions, contacts, walls, reach, normals, solids, 0, np.float32(1.0)
+    )
     for k in range(pairs.start[i], pairs.end[i]):
         j = np.intp(pairs.neighbors[k])
-        count, free = add_walls_of(i, j, positions, contacts, walls, reach, normals, count, free)
+        count, free = add_walls_of(
+            i, j, positions, contacts, walls, reach, normals, solids, count, free
+        )
     return count, free
 
 
@@ -230,17 +239,21 @@ def find_pulls(
     xs, ys, zs = columns[0], columns[1], columns[2]
     colours, by_colour = pulls.colour, pulls.by_colour
     by_gradient, normals = pulls.by_gradient, pulls.normals
+    solids, taken = pulls.walls, pulls.along
     zero = np.float32(0.0)
     for row in prange(marks.shape[0]):
         i = np.intp(row)
         colours[i], by_colour[i] = 1.0, 0.0
         by_gradient[0, i], by_gradient[1, i], by_gradient[2, i] = 0.0, 0.0, 0.0
+        solids[i, 0], solids[i, 1], solids[i, 2] = -1, -1, -1
         if marks[i] == 0:
             continue
         c, gx, gy, gz = sum_colour(columns, grid, law, xs[i], ys[i], zs[i])
         free = np.float32(1.0)
         if near_solids:
-            found, free = look_at_walls(i, positions, pairs, contacts, walls, law.reach, normals[i])
+            found, free = look_at_walls(
+                i, positions, pairs, contacts, walls, law.reach, normals[i], solids[i]
+            )
             free = np.float32(1.0) - mirror * (np.float32(1.0) - free)
             for k in range(found):
                 n = normals[i, k]
@@ -248,6 +261,7 @@ def find_pulls(
                 gx -= along * n[0]
                 gy -= along * n[1]
                 gz -= along * n[2]
+                taken[i, k] = along
         over = np.float32(1.0) / max(free, np.float32(0.05))
         c *= over
         stretch = law.spacing * over
@@ -301,15 +315,31 @@ def tension_displacements(columns, grid, law, marks, before, pulls, pull, displa
 
 @parallel_kernel
 def wall_tension(
-    positions, contacts, motion, law, pull, hold, walls, pulls, scale, displacements, reactions
+    positions,
+    contacts,
+    motion,
+    law,
+    pull,
+    hold,
+    walls,
+    turn,
+    pulls,
+    scale,
+    displacements,
+    reactions,
 ):
     """Displacements by what walls do to the surface tension, and the reactions to them.
+
+    The energy of a particle beside a wall depends on the wall's normal n: of its gradient g that
+    part does not count. Turning the liquid alone changes the energy, and so does turning the wall
+    alone: it bears the torque that pairs of particles lack, (g . n) n x de/dg.
 
     Args:
         positions: [m], (N, 3).
         contacts, motion: of this substep.
         law, walls, pulls: as in `find_pulls`.
         pull: as in `tension_displacements`, times that part of the walls that is a mirror.
+        turn: as `pull` in `tension_displacements` [m^2], float32.
         hold: displacement by adhesion per gradient of the density that walls add [m^2], float32.
         scale: particle mass / substep^2 [kg/s^2].
         displacements: [m], (N, 3); added to.
@@ -317,8 +347,19 @@ def wall_tension(
     """
     terms = contacts.terms
     count = positions.shape[0]
+    solids, taken, normals, by_gradient = pulls.walls, pulls.along, pulls.normals, pulls.by_gradient
     for chunk in prange(reactions.shape[0]):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            for k in range(3):
+                s = solids[i, k]
+                if s < 0:
+                    break
+                size = scale * turn * taken[i, k]
+                nx, ny, nz = normals[i, k, 0], normals[i, k, 1], normals[i, k, 2]
+                tx, ty, tz = by_gradient[0, i], by_gradient[1, i], by_gradient[2, i]
+                reactions[chunk, s, 3] += size * (ny * tz - nz * ty)
+                reactions[chunk, s, 4] += size * (nz * tx - nx * tz)
+                reactions[chunk, s, 5] += size * (nx * ty - ny * tx)
             for k in range(contacts.start[i], contacts.end[i]):
                 _, slope = wall_colour(walls, law.reach, terms[k, DISTANCE])
                 # dc = c / free times the change of the wall's colour, if it is the only one.

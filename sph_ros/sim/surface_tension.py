@@ -139,6 +139,8 @@ class SurfaceTension:
             np.zeros(count, np.float32),
             np.zeros((3, count), np.float32),
             np.zeros((count, 3, 3), np.float32),
+            np.full((count, 3), -1, np.int32),
+            np.zeros((count, 3), np.float32),
         )
 
     def displace(self, work, grid, motion, material, mass, time_step):
@@ -178,6 +180,7 @@ class SurfaceTension:
                 np.float32(mirror * unit / float(law.spacing)),
                 np.float32(max(2.0 * material.adhesion - 1.0, 0.0) * scales.hold * unit),
                 scales.walls,
+                np.float32(unit / float(law.spacing)),
                 self.pulls,
                 np.float32(mass / time_step**2),
                 work.cohesive,
