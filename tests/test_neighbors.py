@@ -14,6 +14,8 @@ from sph_ros.core import neighbors as search
 from sph_ros.core import pressure
 from sph_ros.core import projection as project
 from sph_ros.core import relaxation as relax
+from sph_ros.core.pair_sums import STEPS
+from sph_ros.core.vector import LANES
 from sph_ros.core.weights import lattice_sum
 from sph_ros.sim.state import Workspace, make_grid
 
@@ -68,9 +70,10 @@ def searched(points, power=2):
 
 def neighbors_of(pairs, i):
     """The list of particle i without what fills it up, after a look at that."""
-    start, end, count = pairs.start[i], pairs.end[i], pairs.count[i]
-    assert np.all(pairs.neighbors[start + count : end] == i) and (end - start) % 8 == 0
-    return pairs.neighbors[start : start + count]
+    start, end, stop = pairs.start[i], pairs.end[i], pairs.stop[i // LANES]
+    assert (end - start) % LANES == 0 and end <= stop + i % LANES
+    assert np.all(pairs.neighbors[end:stop:LANES] == i)
+    return pairs.neighbors[start:end:LANES]
 
 
 CLOUDS = ["uniform", "stray", "coincident", "planar", "dense", "single"]
@@ -132,9 +135,8 @@ def iterated(points, power=2):
         work.residuals,
     )
     velocities = np.random.default_rng(2).normal(0.0, 1.0, (len(points), 3)).astype(np.float32)
-    slope = power / (FULL[power] * float(H))
-    rates = np.array([slope, 0.02, 0.01, 0.1, power], np.float32)
-    relax.viscous_impulses(work.pairs, velocities, *rates, work.starts)
+    rates = np.array([0.02, 0.01, 0.1], np.float32)
+    relax.viscous_impulses(work.pairs, work.columns, velocities, H, *rates, work.starts)
     work.scratch[:] = velocities
     corrected(work, guess, work.residuals)
     return work, guess
@@ -177,15 +179,18 @@ def test_displacements_are_those_of_all_pairs_and_keep_momentum(power):
     work, pressures = iterated(cloud("uniform"), power)
     slopes = naive.gradients(work.predicted, float(H), power, FULL[power])
     expected = naive.pressure_displacements(slopes, pressures)
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(work.displacements / scale, expected / scale, atol=1e-5)
+    # Each gradient is rounded to a whole number of steps.
+    near = naive.pairs_within(work.predicted, float(H))
+    both = np.where(near, pressures[:, None] + pressures[None], 0.0).sum(axis=1)
+    slope = power / (FULL[power] * float(H))
+    rounding = 0.5 / STEPS * slope * both + 1e-6 * np.abs(expected).max()
+    assert np.all(np.abs(work.displacements - expected) <= rounding[:, None])
     moved = np.abs(work.displacements).sum(dtype=np.float64)
     assert np.abs(work.displacements.sum(axis=0, dtype=np.float64)).max() < 1e-6 * moved
 
 
-@both_powers
-def test_impulses_are_those_of_all_pairs_and_keep_momentum(power):
-    work, _ = iterated(cloud("uniform"), power)
+def test_impulses_are_those_of_all_pairs_and_keep_momentum():
+    work, _ = iterated(cloud("uniform"))
     v, changed = work.scratch.astype(np.float64), work.starts.astype(np.float64)
     x = work.predicted.astype(np.float64)
     offset = x[:, None] - x[None]
@@ -195,11 +200,8 @@ def test_impulses_are_those_of_all_pairs_and_keep_momentum(power):
     u = np.maximum(1.0 - r / float(H), 0.0)
     # Clavet 2005, alg. 5; what approaches has a negative speed of separation.
     speed = -np.einsum("ijk,ijk->ij", v[:, None] - v[None], line)
-    rim = (u / (u + 1e-3)) ** (
-        power - 1
-    )  # pairs at the rim of the support count less: no division by zero
-    share = u * np.minimum(0.02 + 0.01 * np.maximum(speed, 0.0) * rim, 0.1)
-    expected = v + np.einsum("ij,ijk->ik", share * speed * rim**2, line)
+    share = u * np.minimum(0.02 + 0.01 * np.maximum(speed, 0.0), 0.1)
+    expected = v + np.einsum("ij,ijk->ik", share * speed, line)
     np.testing.assert_allclose(changed, expected, atol=2e-5)
     assert np.abs((changed - v).sum(axis=0)).max() < 1e-4
 
@@ -255,8 +257,10 @@ def test_processors_without_vector_instructions_find_the_same(tmp_path):
         for i in range(400):
             mine = neighbors_of(work.pairs, i)
             np.testing.assert_array_equal(mine, other[f"arr_{i}"])
-        # Packed displacements are off by 2e-6 h at most: times 30 gradients of 3 / (h FULL).
-        for k, (mine, tolerance) in enumerate(zip(sums, [3e-6] * 4 + [2.4e-5] * 2, strict=True)):
+        # Gradients may be rounded to another step. Packed displacements are off by 2e-6 h at most:
+        # times 30 gradients of 3 / (h FULL).
+        tolerances = [3e-6, 3e-6, 1.0 / STEPS, 3e-6, 2.4e-5 + 1.0 / STEPS, 2.4e-5 + 1.0 / STEPS]
+        for k, (mine, tolerance) in enumerate(zip(sums, tolerances, strict=True)):
             scale = np.abs(mine).max()
             np.testing.assert_allclose(
                 mine / scale, other[f"arr_{400 + k}"] / scale, atol=tolerance

@@ -24,6 +24,21 @@ from numba import prange
 from sph_ros.core.contacts import GRADIENT, NEAR_GRADIENT, SURFACE_VELOCITY, add_reaction
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.pair_sums import STEPS, TINY, filling_of
+from sph_ros.core.vector import (
+    LANES,
+    gather,
+    gather_column,
+    inverse_root,
+    lanes_from,
+    larger,
+    load,
+    put,
+    smaller,
+    spread,
+    store,
+    take,
+)
 
 
 class State(NamedTuple):
@@ -96,56 +111,42 @@ def sum_densities(columns, velocities, support_radius, factors, pairs, state):
         pairs: `gradients` is written: spiky gradient at i [1/m] and u.
         state: `density` and `rate` are written, without the walls.
     """
-    one, two = np.float32(1.0), np.float32(2.0)
+    zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
     inverse_h = one / support_radius
     density_scale, spiky_scale = factors.density_scale, factors.spiky_scale
     # Gradient of poly6 over that of spiky, per q (2 - u)^2.
-    ratio = factors.colour_slope / spiky_scale
+    ratio = -factors.colour_slope
     xs, ys, zs = columns[0], columns[1], columns[2]
-    density, rate = state.density, state.rate
-    for i in prange(pairs.start.shape[0]):
-        x, y, z = xs[i], ys[i], zs[i]
-        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
-        w, change = np.float32(0.0), np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        # One loop for each array written, as in `neighbors.sum_densities`.
-        for k in range(js.shape[0]):
-            j = js[k]
-            dx = x - xs[j]
-            dy = y - ys[j]
-            dz = z - zs[j]
-            # The tiny addend lets a particle be its own neighbour: 0 / tiny is 0.
-            us[k] = dx * dx + dy * dy + dz * dz + np.float32(1e-20)
-        for k in range(js.shape[0]):
-            r2 = us[k]
-            inverse_r = one / np.sqrt(r2)
-            u = max(one - r2 * inverse_r * inverse_h, np.float32(0.0))
-            us[k] = u
-            gx[k] = -spiky_scale * u * u * inverse_r
+    density, rate, count = state.density, state.rate, pairs.start.shape[0]
+    pairs.unit[0] = -spiky_scale / STEPS
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
+        vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
+        vz = gather_column(velocities, rows, 2)
+        w, change = spread(zero), spread(zero)
+        for k in range(pairs.start[first], pairs.stop[s], LANES):
+            j = load(pairs.neighbors, k)
+            dx, dy, dz = x - gather(xs, j), y - gather(ys, j), z - gather(zs, j)
+            r2 = dx * dx + dy * dy + dz * dz + TINY
+            inverse_r = inverse_root(r2)
+            u = larger(one - inverse_h * (r2 * inverse_r), spread(zero))
+            factor = u * u * inverse_r
+            dx, dy, dz = factor * dx, factor * dy, factor * dz
+            store(STEPS * u, pairs.nearness, k)
+            store(STEPS * dx, pairs.x, k)
+            store(STEPS * dy, pairs.y, k)
+            store(STEPS * dz, pairs.z, k)
             c = u * (two - u)
             w += c * c * c
-        for k in range(js.shape[0]):
-            gy[k] = gx[k] * (y - ys[js[k]])
-        for k in range(js.shape[0]):
-            gz[k] = gx[k] * (z - zs[js[k]])
-        for k in range(js.shape[0]):
-            gx[k] = gx[k] * (x - xs[js[k]])
-        for k in range(js.shape[0]):
-            j = js[k]
-            u = us[k]
-            along = (
-                gx[k] * (vx - velocities[j, 0])
-                + gy[k] * (vy - velocities[j, 1])
-                + gz[k] * (vz - velocities[j, 2])
-            )
+            along = dx * (vx - gather_column(velocities, j, 0))
+            along += dy * (vy - gather_column(velocities, j, 1))
+            along += dz * (vz - gather_column(velocities, j, 2))
             change += (one - u) * (two - u) * (two - u) * along
         # Each entry that only fills the list has counted as the particle itself, with weight 1.
-        filling = np.float32(end - start - pairs.count[i])
-        density[i] = density_scale * (w - filling)
-        rate[i] = ratio * change
+        put(density_scale * (w - filling_of(pairs, first)), density, first)
+        put(ratio * change, rate, first)
 
 
 @parallel_kernel
@@ -197,32 +198,43 @@ def pair_forces(pairs, velocities, factors, contact_gradients, state, accelerati
         accelerations: [m/s^2], (N, 3); written.
     """
     pressure, volume, viscosity = state.pressure, state.volume, state.viscosity
+    lightness, walls, count = state.lightness, contact_gradients, state.pressure.shape[0]
     half_drag, push = np.float32(0.5) * factors.drag, factors.push
-    inverse_slope = np.float32(1.0) / factors.spiky_scale
-    for i in prange(pressure.shape[0]):
-        p, mu = pressure[i], viscosity[i]
-        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
-        ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            u = us[k]
-            dx, dy, dz = vx - velocities[j, 0], vy - velocities[j, 1], vz - velocities[j, 2]
-            along = max(dx * gx[k] + dy * gy[k] + dz * gz[k], np.float32(0.0))
-            approach = along * inverse_slope / (u * u + np.float32(1e-6))
-            both = volume[j] * (p + pressure[j] + factors.collision * approach * approach)
-            share = half_drag * volume[j] * (mu + viscosity[j]) * u
-            ax -= push * both * gx[k] + share * dx
-            ay -= push * both * gy[k] + share * dy
-            az -= push * both * gz[k] + share * dz
-        wall = push * volume[i] * p
-        scale = volume[i] * state.lightness[i]
-        accelerations[i, 0] = scale * (ax - wall * contact_gradients[i, 3])
-        accelerations[i, 1] = scale * (ay - wall * contact_gradients[i, 4])
-        accelerations[i, 2] = scale * (az - wall * contact_gradients[i, 5])
+    zero, step = np.float32(0.0), np.float32(1.0) / STEPS
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        p, mu, own, unit = (
+            take(pressure, first),
+            take(viscosity, first),
+            take(volume, first),
+            pairs.unit[0],
+        )
+        vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
+        vz = gather_column(velocities, rows, 2)
+        ax, ay, az = spread(zero), spread(zero), spread(zero)
+        for k in range(pairs.start[first], pairs.stop[s], LANES):
+            j = load(pairs.neighbors, k)
+            u = step * load(pairs.nearness, k)
+            x, y, z = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+            dx = vx - gather_column(velocities, j, 0)
+            dy = vy - gather_column(velocities, j, 1)
+            dz = vz - gather_column(velocities, j, 2)
+            along = smaller(dx * x + dy * y + dz * z, spread(zero))
+            approach = step * along / (u * u + np.float32(1e-6))
+            there = gather(volume, j)
+            both = p + gather(pressure, j) + factors.collision * approach * approach
+            both = (push * unit) * there * both
+            share = half_drag * there * (mu + gather(viscosity, j)) * u
+            ax -= both * x + share * dx
+            ay -= both * y + share * dy
+            az -= both * z + share * dz
+        wall = push * own * p
+        scale = own * take(lightness, first)
+        ax = scale * (ax - wall * gather_column(walls, rows, 3))
+        ay = scale * (ay - wall * gather_column(walls, rows, 4))
+        az = scale * (az - wall * gather_column(walls, rows, 5))
+        put((ax, ay, az), accelerations, first)
 
 
 @parallel_kernel
@@ -246,29 +258,25 @@ def colour_forces(pairs, contacts, laplacians, factors, state, accelerations, to
     volume, lightness, family = state.volume, state.lightness, state.family
     d = factors.dimension
     curve = factors.colour_laplacian
-    slope = factors.colour_slope / factors.spiky_scale
+    # Gradient of poly6 over that of spiky, per q (2 - u)^2, and what gradients are kept in.
+    slope, step = -factors.colour_slope / STEPS, one / STEPS
     per_row = np.float32(laplacians.shape[0] - 1) / factors.full_share
     count = volume.shape[0]
     for chunk in prange(totals.shape[0]):
         fx, fy, fz = 0.0, 0.0, 0.0
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            start, end = pairs.start[i], pairs.end[i]
-            js = pairs.neighbors[start:end]
-            gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-            gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
             nx, ny, nz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             bend = np.float32(0.0)
-            for k in range(js.shape[0]):
-                j, u = js[k], us[k]
+            for k in range(pairs.start[i], pairs.end[i], LANES):
+                j, u = np.int64(pairs.neighbors[k]), step * np.float32(pairs.nearness[k])
                 q = one - u
                 v = volume[j] if family[j] == family[i] else np.float32(0.0)
                 c = v * q * (two - u) * (two - u)
-                nx += c * gx[k]
-                ny += c * gy[k]
-                nz += c * gz[k]
+                nx += c * np.float32(pairs.x[k])
+                ny += c * np.float32(pairs.y[k])
+                nz += c * np.float32(pairs.z[k])
                 bend += v * u * (two - u) * (d - (d + np.float32(4.0)) * q * q)
-            filling = np.float32(end - start - pairs.count[i])
-            bend = curve * (bend - filling * volume[i] * d)
+            bend *= curve
             nx, ny, nz = slope * nx, slope * ny, slope * nz
             share = contacts.density[i, 0]
             if share > np.float32(0.0):

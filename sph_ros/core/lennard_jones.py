@@ -13,6 +13,7 @@ from numba import prange
 from sph_ros.core.contacts import GRADIENT, add_reaction
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.vector import LANES
 
 #: Pairs do not repel harder than at this distance, in a: a pair that starts closer must not fly
 #: apart at any speed.
@@ -62,12 +63,11 @@ def pair_forces(
         vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         mine = family[i]
         ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        js = pairs.neighbors[pairs.start[i] : pairs.end[i]]
-        for k in range(js.shape[0]):
-            j = js[k]
+        for k in range(pairs.start[i], pairs.end[i], LANES):
+            j = np.int64(pairs.neighbors[k])
             dx, dy, dz = x - xs[j], y - ys[j], z - zs[j]
             r2 = dx * dx + dy * dy + dz * dz
-            # A particle is its own neighbour, and fills its list: its offset of 0 takes it out.
+            # A particle is its own neighbour: its offset of 0 takes it out.
             inverse_r = one / np.sqrt(r2 + np.float32(1e-20))
             near2 = one / max(r2, nearest)
             six = (square * near2) ** 3

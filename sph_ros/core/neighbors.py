@@ -13,17 +13,29 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.jit import bare, device, kernel, parallel_kernel
-from sph_ros.core.pair_sums import geometry_of_pairs
-from sph_ros.core.vector import LANES, append_within
+from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
+from sph_ros.core.vector import (
+    LANES,
+    append_within,
+    gather,
+    gather_column,
+    inverse_root,
+    lanes_from,
+    larger,
+    load,
+    put,
+    spread,
+    store,
+    take,
+    where_whole,
+)
 
-#: Particles handled by one piece of parallel work; fixed, so that no sum depends on the threads.
+#: Particles handled by one piece of parallel work, whole slices; fixed, so that no sum depends on
+#: the threads.
 CHUNK = 256
 
 #: Coordinates of sixteen particles.
 BLOCK = 48
-
-#: Lists have a multiple of so many entries.
-LIST_STEP = 8
 
 
 class Grid(NamedTuple):
@@ -40,29 +52,6 @@ class Grid(NamedTuple):
     inverse_cell: np.float32
     counts: np.ndarray
     cell_start: np.ndarray
-
-
-class Pairs(NamedTuple):
-    """Neighbours and pair geometry; the list of particle i is rows start[i]:end[i].
-
-    Lists are filled up to a multiple of `LIST_STEP` with the particle itself: its gradient with
-    itself is zero, so no sum over gradients notices, and vector loops leave no remainder. Kernels
-    take slices of the rows first, which tells the compiler that indices count from 0; only then it
-    makes vector code of the loop.
-
-    Attributes:
-        start, end: (N,) int64.
-        count: neighbours without the filling, (N,) int32.
-        neighbors: rows of the neighbours, (M,) uint32.
-        gradients: gradient at i of the normalised density weight, x, y, z [1/m], and 1 - r/h [-],
-            (4, M) float32.
-    """
-
-    start: np.ndarray
-    end: np.ndarray
-    count: np.ndarray
-    neighbors: np.ndarray
-    gradients: np.ndarray
 
 
 class Sums(NamedTuple):
@@ -212,15 +201,30 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
 
 
 @bare
-def fill_list(i, neighbors, start, cursor):
-    """Fill the list that begins at `start` with i itself to a whole number of steps; the new end.
+def store_slice(first, staged, pairs, cursor, width):
+    """Bring the lists of a slice from one after the other to side by side.
 
-    A whole step is written always, without a branch. There is room: a search stops where fewer than
-    `LANES` entries are left.
+    Args:
+        first: particle of the slice.
+        staged: the lists; those of particle i are staged[start[i]:end[i]] (M,) uint32.
+        pairs: lists are written, and their starts and ends changed to where they are then.
+        cursor: where the entries of the slice begin.
+        width: length of its longest list.
     """
-    for k in range(LIST_STEP):
-        neighbors[cursor + k] = i
-    return start + (cursor - start + LIST_STEP - 1) // LIST_STEP * LIST_STEP
+    starts, ends, neighbors = pairs.start, pairs.end, pairs.neighbors
+    count = starts.shape[0]
+    own = lanes_from(first, count)
+    begins, stops = take(starts, first), take(ends, first)
+    for k in range(width):
+        places = begins + k
+        listed = places < stops
+        found = gather(staged, where_whole(listed, places, begins))
+        store(where_whole(listed, found, own), neighbors, cursor + k * LANES)
+    for i in range(first, min(first + LANES, count)):
+        length = ends[i] - starts[i]
+        starts[i] = cursor + i - first
+        ends[i] = starts[i] + length * LANES
+    pairs.stop[first // LANES] = cursor + width * LANES
 
 
 @parallel_kernel
@@ -235,7 +239,7 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
         grid: from `sort_by_cell`.
         support_radius: h [m], float32.
         chunks: `chunk_count(N)`.
-        pairs: all but the gradients is written.
+        pairs: the lists are written.
 
     Returns:
         Number of chunks whose part was too small: enlarge the list and call again if it is not 0.
@@ -244,20 +248,24 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     room = pairs.neighbors.shape[0] // chunks
     square = support_radius * support_radius
     full = 0
-    starts, ends, counts = pairs.start, pairs.end, pairs.count
+    starts, ends = pairs.start, pairs.end
     for chunk in prange(chunks):
-        cursor = np.intp(chunk * room)
-        limit = cursor + room - LANES  # vectors may reach beyond the last list
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            start = cursor
-            cursor = append_neighbors(i, columns, grid, square, pairs.neighbors, cursor, limit)
-            if cursor < 0:
+        staged = np.empty(room // 4 + LANES, np.uint32)
+        cursor, limit = np.intp(chunk * room), np.intp((chunk + 1) * room)
+        for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
+            place, width = np.intp(0), np.intp(0)
+            for i in range(first, min(first + LANES, count)):
+                begin = place
+                place = append_neighbors(i, columns, grid, square, staged, place, staged.shape[0])
+                if place < 0:
+                    break
+                starts[i], ends[i] = begin, place
+                width = max(width, place - begin)
+            if place < 0 or cursor + width * LANES > limit:
                 full += 1
                 break
-            starts[i] = start
-            counts[i] = cursor - start
-            cursor = fill_list(i, pairs.neighbors, start, cursor)
-            ends[i] = cursor
+            store_slice(first, staged, pairs, cursor, width)
+            cursor += width * LANES
     return full
 
 
@@ -283,18 +291,15 @@ def sum_densities(
     density, near_density = sums.density, sums.near_density
     gradient, gradient_square = sums.gradient, sums.gradient_square
     count = pairs.start.shape[0]
+    pairs.unit[0] = slope / STEPS
     for chunk in prange(chunks):
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, i, slope, inverse_h, bend)
-            # Each entry that only fills the list has counted as the particle itself, with weight 1.
-            filling = np.float32(pairs.end[i] - pairs.start[i] - pairs.count[i])
-            density[i] = density_scale * (w - filling) + wall_density[i, 0]
-            near_density[i] = near_scale * (n - filling) + wall_density[i, 1]
-            gradient[i, 0] = x
-            gradient[i, 1] = y
-            gradient[i, 2] = z
-            # Every entry counts its squared gradient here, the particle itself slope^2 each time.
-            gradient_square[i] = square - slope * slope * (filling + np.float32(1.0))
+        for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
+            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, first, inverse_h, bend)
+            rows = lanes_from(first, count)
+            put(density_scale * w + gather_column(wall_density, rows, 0), density, first)
+            put(near_scale * n + gather_column(wall_density, rows, 1), near_density, first)
+            put((slope * x, slope * y, slope * z), gradient, first)
+            put((slope * slope) * square, gradient_square, first)
 
 
 @parallel_kernel
@@ -321,21 +326,25 @@ def densities_of_pairs(
         density: relative to rest [-], (N,); written.
     """
     inverse_h = np.float32(1.0) / support_radius
-    for i in prange(density.shape[0]):
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        w = np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            dx = x - positions[j, 0]
-            dy = y - positions[j, 1]
-            dz = z - positions[j, 2]
-            u = np.float32(1.0) - np.sqrt(dx * dx + dy * dy + dz * dz) * inverse_h
-            u = u if u > np.float32(0.0) else np.float32(0.0)
-            w += u * u
-        filling = np.float32(end - start - pairs.count[i])
-        wall = wall_density[i, 0]
-        for axis in range(3):
-            wall += wall_gradients[i, axis] * (positions[i, axis] - listed[i, axis])
-        density[i] = density_scale * (w - filling) + max(wall, np.float32(0.0))
+    zero, one = np.float32(0.0), np.float32(1.0)
+    count = density.shape[0]
+    for s in prange((count + LANES - 1) // LANES):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        x, y = gather_column(positions, rows, 0), gather_column(positions, rows, 1)
+        z = gather_column(positions, rows, 2)
+        weights = spread(zero)
+        for k in range(pairs.start[first], pairs.stop[s], LANES):
+            j = load(pairs.neighbors, k)
+            dx = x - gather_column(positions, j, 0)
+            dy = y - gather_column(positions, j, 1)
+            dz = z - gather_column(positions, j, 2)
+            r2 = dx * dx + dy * dy + dz * dz + TINY
+            u = larger(one - inverse_h * (r2 * inverse_root(r2)), spread(zero))
+            weights += u * u
+        wall = gather_column(wall_density, rows, 0)
+        wall += gather_column(wall_gradients, rows, 0) * (x - gather_column(listed, rows, 0))
+        wall += gather_column(wall_gradients, rows, 1) * (y - gather_column(listed, rows, 1))
+        wall += gather_column(wall_gradients, rows, 2) * (z - gather_column(listed, rows, 2))
+        weights = density_scale * (weights - filling_of(pairs, first))
+        put(weights + larger(wall, spread(zero)), density, first)

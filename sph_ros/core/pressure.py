@@ -13,6 +13,18 @@ from numba import prange
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import divergence_of_pairs, pack, push_by_pairs
+from sph_ros.core.vector import (
+    LANES,
+    gather_column,
+    lanes_from,
+    larger,
+    magnitude,
+    put,
+    spread,
+    take,
+    total,
+    where,
+)
 
 #: Fields of the state of an iteration, an array of float64; see `fresh_state`.
 ITERATION, SHARE, INERTIA, BEFORE, BEST, ENOUGH, ERROR, DONE, FIELDS = range(9)
@@ -66,15 +78,16 @@ def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
 
 @inlined
 def _displace(
-    i, pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
+    first, pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
 ):
-    own = pressures[i]
-    x, y, z = push_by_pairs(pairs, pressures, i)
-    x = cohesive[i, 0] - x - own * contact_gradients[i, 0]
-    y = cohesive[i, 1] - y - own * contact_gradients[i, 1]
-    z = cohesive[i, 2] - z - own * contact_gradients[i, 2]
-    displacements[i, 0], displacements[i, 1], displacements[i, 2] = x, y, z
-    packed[i] = pack(x, y, z, support_radius)
+    """What `pressure_displacements` does, for the slice that begins at particle `first`."""
+    rows = lanes_from(first, pressures.shape[0])
+    own, x, y, z = push_by_pairs(pairs, pressures, first)
+    x = gather_column(cohesive, rows, 0) - x - own * gather_column(contact_gradients, rows, 0)
+    y = gather_column(cohesive, rows, 1) - y - own * gather_column(contact_gradients, rows, 1)
+    z = gather_column(cohesive, rows, 2) - z - own * gather_column(contact_gradients, rows, 2)
+    put((x, y, z), displacements, first)
+    put(pack(x, y, z, support_radius), packed, first)
 
 
 @parallel_kernel
@@ -95,18 +108,37 @@ def pressure_displacements(
         displacements: [m], (N, 3); written.
         packed: the same by `pack`, (N,) int64; written.
     """
-    for i in prange(pressures.shape[0]):
+    for s in prange(pairs.stop.shape[0]):
         _displace(
-            i, pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
-        )
+            s * LANES, pairs, pressures, contact_gradients, cohesive, support_radius,
+            displacements, packed,
+        )  # fmt: skip
 
 
 @inlined
-def _density_change(i, pairs, contact_gradients, support_radius, displacements, packed):
-    change = divergence_of_pairs(pairs, displacements, packed, i, support_radius)
+def _density_change(first, pairs, contact_gradients, support_radius, displacements, packed):
+    """How much denser a slice gets [-]."""
+    rows = lanes_from(first, packed.shape[0])
+    change = divergence_of_pairs(pairs, packed, first, support_radius)
     for axis in range(3):
-        change += contact_gradients[i, axis] * displacements[i, axis]
+        wall = gather_column(contact_gradients, rows, axis)
+        change += wall * gather_column(displacements, rows, axis)
     return change
+
+
+@inlined
+def _correct(first, residual, yielded, compliance, diagonal, share, momentum, pressures, guesses):
+    """Take one step for a slice; returns the sum of its errors."""
+    pressure, zero = take(guesses, first), spread(np.float32(0.0))
+    residual -= take(yielded, first) + compliance * pressure
+    better = larger(pressure + share * residual / take(diagonal, first), zero)
+    ahead = larger(better + momentum * (better - take(pressures, first)), zero)
+    put(ahead, guesses, first)
+    put(better, pressures, first)
+    # Where there is no pressure a lack of density is a free surface, not an error.
+    wrong = (residual > zero) | (pressure > zero)
+    wrong = wrong & (lanes_from(first, first + LANES) < guesses.shape[0])
+    return total(where(wrong, magnitude(residual), zero))
 
 
 @parallel_kernel
@@ -160,40 +192,33 @@ def iterate_pressures(
     for _ in range(steps):
         known = state[ITERATION] == 0.0 and residuals.shape[0] == count
         if not known:
-            for i in prange(count):
+            for s in prange(pairs.stop.shape[0]):
                 _displace(
-                    i, pairs, guesses, contact_gradients, cohesive, support_radius, displacements,
-                    packed,
+                    s * LANES, pairs, guesses, contact_gradients, cohesive, support_radius,
+                    displacements, packed,
                 )  # fmt: skip
         inertia = state[INERTIA]
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia * inertia))
         share, momentum = np.float32(state[SHARE]), np.float32((inertia - 1.0) / grown)
         for chunk in prange(errors.shape[0]):
             error = 0.0
-            for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
                 if known:
-                    residual = residuals[i]
+                    residual = take(residuals, row)
                 else:
-                    residual = (
-                        densities[i]
-                        - np.float32(1.0)
-                        + _density_change(
-                            i, pairs, contact_gradients, support_radius, displacements, packed
-                        )
+                    residual = take(densities, row) - np.float32(1.0)
+                    residual += _density_change(
+                        row, pairs, contact_gradients, support_radius, displacements, packed
                     )
-                pressure = guesses[i]
-                residual -= yielded[i] + compliance * pressure
-                better = max(pressure + share * residual / diagonal[i], np.float32(0.0))
-                guesses[i] = max(better + momentum * (better - pressures[i]), np.float32(0.0))
-                pressures[i] = better
-                # Where there is no pressure a lack of density is a free surface, not an error.
-                if residual > np.float32(0.0) or pressure > np.float32(0.0):
-                    error += abs(residual)
+                error += _correct(
+                    row, residual, yielded, compliance, diagonal, share, momentum, pressures,
+                    guesses,
+                )  # fmt: skip
             errors[chunk] = error
-        total = 0.0
+        sum_of_errors = 0.0
         for chunk in range(errors.shape[0]):
-            total += errors[chunk]
-        error = total / max(count, 1)
+            sum_of_errors += errors[chunk]
+        error = sum_of_errors / max(count, 1)
         if state[ITERATION] == 0.0:
             state[ENOUGH] = min(max(goal[0], goal[1] * error), goal[2])
         state[ITERATION] += 1.0
@@ -210,8 +235,8 @@ def iterate_pressures(
                 pressures[i] = guesses[i] = first[i]
         state[BEST] = min(state[BEST], error)
     if state[DONE] > 0.0:
-        for i in prange(count):
+        for s in prange(pairs.stop.shape[0]):
             _displace(
-                i, pairs, pressures, contact_gradients, cohesive, support_radius, displacements,
-                packed,
+                s * LANES, pairs, pressures, contact_gradients, cohesive, support_radius,
+                displacements, packed,
             )  # fmt: skip

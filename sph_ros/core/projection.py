@@ -25,7 +25,18 @@ from sph_ros.core.contacts import (
 )
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
-from sph_ros.core.pair_sums import growth_by_pairs
+from sph_ros.core.pair_sums import weights_after
+from sph_ros.core.vector import (
+    LANES,
+    gather_column,
+    lanes_from,
+    larger,
+    put,
+    smaller,
+    spread,
+    take,
+    where,
+)
 
 #: Excess of density that may be taken back over several steps [-].
 MILD = np.float32(0.01)
@@ -114,24 +125,31 @@ def density_targets(
         residuals: what of the density above 1 is to be taken back at the given displacements [-],
             (N,); written.
     """
-    one, zero = np.float32(1.0), np.float32(0.0)
+    one = np.float32(1.0)
     bend = power - np.float32(2.0)
-    for i in prange(targets.shape[0]):
-        grown, linear = growth_by_pairs(
-            pairs, columns, displacements, packed, i, support_radius, bend
-        )
-        excess = density[i] - one
-        if excess > zero:
-            excess = share * min(excess, MILD) + rest * max(excess - MILD, zero)
-        for k in range(contacts.start[i], contacts.end[i]):
-            t = contacts.terms[k]
-            for axis in range(3):
-                excess -= time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
-        excess += density_scale * grown
-        targets[i] = one + excess - linear
+    count, walls = targets.shape[0], contacts.density
+    gradients = contacts.gradients
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows, zero = lanes_from(first, count), spread(np.float32(0.0))
+        weights, linear = weights_after(pairs, columns, packed, first, support_radius, bend)
+        now = take(density, first)
+        excess, mild = now - one, spread(MILD)
+        back = share * smaller(excess, mild) + rest * larger(excess - mild, zero)
+        wanted = where(excess > zero, back, excess)
+        wanted += density_scale * weights - (now - gather_column(walls, rows, 0))
+        put(wanted - linear + one, targets, first)
         for axis in range(3):
-            excess += contacts.gradients[i, axis] * displacements[i, axis]
-        residuals[i] = excess
+            moved = gather_column(displacements, rows, axis)
+            wanted += gather_column(gradients, rows, axis) * moved
+        put(wanted, residuals, first)
+        for i in range(first, min(first + LANES, count)):
+            for k in range(contacts.start[i], contacts.end[i]):
+                t = contacts.terms[k]
+                for axis in range(3):
+                    brought = time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
+                    targets[i] -= brought
+                    residuals[i] -= brought
 
 
 @parallel_kernel

@@ -21,7 +21,8 @@ from numba import prange
 
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
-from sph_ros.core.pair_sums import impulse_of_pairs
+from sph_ros.core.pair_sums import STEPS, impulse_of_pairs
+from sph_ros.core.vector import LANES, gather, gather_column, lanes_from, load, put, spread, take
 
 
 class Tension(NamedTuple):
@@ -77,32 +78,30 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
     cohesion, near = tension.cohesion, tension.near * tension.virial_ratio
     offset = cohesion + tension.near
     density, near_density = sums.density, sums.near_density
-    for i in prange(pairs.start.shape[0]):
-        own = cohesion * sums.density[i] - offset
-        own_near = near * sums.near_density[i]
-        x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            both = own + cohesion * density[j] - offset
-            both_near = own_near + near * near_density[j]
-            c = both + weight_ratio * us[k] * both_near
-            x += c * gx[k]
-            y += c * gy[k]
-            z += c * gz[k]
-        wall = tension.adhesion * own
-        wall_near = own_near
-        g = contact_gradients
-        displacements[i, 0] = -x - wall * g[i, 0] - wall_near * g[i, 3]
-        displacements[i, 1] = -y - wall * g[i, 1] - wall_near * g[i, 4]
-        displacements[i, 2] = -z - wall * g[i, 2] - wall_near * g[i, 5]
+    g, step, count = contact_gradients, weight_ratio / STEPS, density.shape[0]
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        own = cohesion * take(density, first) - offset
+        own_near = near * take(near_density, first)
+        x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
+        for k in range(pairs.start[first], pairs.stop[s], LANES):
+            j = load(pairs.neighbors, k)
+            both = own + (cohesion * gather(density, j) - offset)
+            both_near = own_near + near * gather(near_density, j)
+            c = both + step * load(pairs.nearness, k) * both_near
+            x += c * load(pairs.x, k)
+            y += c * load(pairs.y, k)
+            z += c * load(pairs.z, k)
+        unit, wall = -pairs.unit[0], tension.adhesion * own
+        x = unit * x - wall * gather_column(g, rows, 0) - own_near * gather_column(g, rows, 3)
+        y = unit * y - wall * gather_column(g, rows, 1) - own_near * gather_column(g, rows, 4)
+        z = unit * z - wall * gather_column(g, rows, 2) - own_near * gather_column(g, rows, 5)
+        put((x, y, z), displacements, first)
 
 
 @parallel_kernel
-def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, power, changed):
+def viscous_impulses(pairs, columns, velocities, support_radius, linear, quadratic, most, changed):
     """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
 
     The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also
@@ -110,60 +109,57 @@ def viscous_impulses(pairs, velocities, slope, linear, quadratic, most, power, c
     only so much of a relative speed that together they do not overshoot: that is `most`.
 
     Args:
-        pairs: from `sum_densities`.
+        pairs: from `find_neighbors`.
+        columns: coordinates [m], as there.
         velocities: [m/s], (N, 3).
-        slope: length of a pair's gradient divided by (1 - r/h)^(power - 1) [1/m], float32.
+        support_radius: h [m], float32.
         linear: impulse per relative speed, time step included [-], float32.
         quadratic: impulse per squared relative speed, time step included [s/m], float32.
         most: share of the relative speed that a pair at zero distance may take [-], float32.
-        power: of the density's weight, as in `sum_densities`.
         changed: velocities afterwards [m/s], (N, 3); written.
     """
-    inverse_slope2 = np.float32(1.0) / (slope * slope)
-    bend = power - np.float32(2.0)
-    for i in prange(velocities.shape[0]):
-        x, y, z = impulse_of_pairs(pairs, velocities, i, linear, quadratic / slope, most, bend)
-        changed[i, 0] = velocities[i, 0] - inverse_slope2 * x
-        changed[i, 1] = velocities[i, 1] - inverse_slope2 * y
-        changed[i, 2] = velocities[i, 2] - inverse_slope2 * z
+    inverse_h, count = np.float32(1.0) / support_radius, velocities.shape[0]
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        x, y, z = impulse_of_pairs(
+            pairs, columns, velocities, first, inverse_h, linear, quadratic, most
+        )
+        rows = lanes_from(first, count)
+        x = gather_column(velocities, rows, 0) - x
+        y = gather_column(velocities, rows, 1) - y
+        z = gather_column(velocities, rows, 2) - z
+        put((x, y, z), changed, first)
 
 
 @parallel_kernel
-def viscous_operator(pairs, velocities, slope, linear, power, result):
+def viscous_operator(pairs, columns, velocities, support_radius, linear, result):
     """Left side of implicit viscosity: v minus the linear impulses that v itself would cause.
 
     Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum
     is kept by every iteration.
 
     Args:
-        pairs, velocities, slope, linear, power: as in `viscous_impulses`.
+        pairs, columns, velocities, support_radius, linear: as in `viscous_impulses`.
         result: [m/s], (N, 3); written.
     """
-    scale = linear / (slope * slope)
-    one, bend = np.float32(1.0), power - np.float32(2.0)
-    for i in prange(velocities.shape[0]):
-        vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
-        ax, ay, az = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            along = (
-                (vx - velocities[j, 0]) * gx[k]
-                + (vy - velocities[j, 1]) * gy[k]
-                + (vz - velocities[j, 2]) * gz[k]
-            )
-            above = us[k] + np.float32(1e-3)
-            bent = one + bend * (above - one)
-            c = scale * along / (above * bent * bent)
-            ax += c * gx[k]
-            ay += c * gy[k]
-            az += c * gz[k]
-        result[i, 0] = vx + ax
-        result[i, 1] = vy + ay
-        result[i, 2] = vz + az
+    inverse_h, count = np.float32(1.0) / support_radius, velocities.shape[0]
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        x, y, z = impulse_of_pairs(
+            pairs,
+            columns,
+            velocities,
+            first,
+            inverse_h,
+            linear,
+            np.float32(0.0),
+            np.float32(np.inf),
+        )
+        rows = lanes_from(first, count)
+        x = gather_column(velocities, rows, 0) + x
+        y = gather_column(velocities, rows, 1) + y
+        z = gather_column(velocities, rows, 2) + z
+        put((x, y, z), result, first)
 
 
 @parallel_kernel

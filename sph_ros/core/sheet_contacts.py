@@ -34,6 +34,7 @@ from sph_ros.core.sheets import (
     nearest_in_cell,
     nearest_on_sheet,
 )
+from sph_ros.core.vector import LANES
 from sph_ros.core.walls import MIRRORED, wall_share
 
 _ONE = np.float32(1.0)
@@ -263,43 +264,53 @@ def is_parted(sheets, motion, ax, ay, az, bx, by, bz):
     return False
 
 
+@inlined
+def has_between(sheets, motion, contacts, i, j, xs, ys, zs):
+    """Whether a sheet parts particle i, which is near a solid, from j."""
+    if j == i or contacts.start[j] == contacts.end[j]:
+        return False
+    dx, dy, dz = xs[j] - xs[i], ys[j] - ys[i], zs[j] - zs[i]
+    sheet_of = sheets.sheet_of
+    if not (
+        is_behind(contacts, sheet_of, i, dx, dy, dz)
+        or is_behind(contacts, sheet_of, j, -dx, -dy, -dz)
+    ):
+        return False
+    a, b = min(i, j), max(i, j)
+    return is_parted(sheets, motion, xs[a], ys[a], zs[a], xs[b], ys[b], zs[b])
+
+
 @parallel_kernel
 def part_pairs(columns, sheets, motion, contacts, chunks, pairs):
     """Take neighbours off the lists that a sheet parts from the particle.
 
-    A parted neighbour's entry becomes the particle itself, which no sum over a list counts. Both
-    lists of a pair are decided by the same test, so a pair stays a pair.
+    The last one of the list takes the place of a parted neighbour, and the particle itself that of
+    the last one. Both lists of a pair are decided by the same test, so a pair stays a pair.
 
     Args:
         columns: coordinates that the lists were made from [m], (3, N + padding).
         sheets, motion: the sheets and the poses of all solids.
         contacts: of the particles.
         chunks: `chunk_count(N)`.
-        pairs: neighbours and counts are changed.
+        pairs: neighbours and ends are changed.
     """
     xs, ys, zs = columns[0], columns[1], columns[2]
-    neighbors, counts, starts, ends = pairs.neighbors, pairs.count, pairs.start, pairs.end
-    sheet_of = sheets.sheet_of
+    neighbors, starts, ends = pairs.neighbors, pairs.start, pairs.end
     first, last = contacts.start, contacts.end
     count = starts.shape[0]
     for chunk in prange(chunks):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             if first[i] == last[i]:
                 continue
-            for k in range(starts[i], ends[i]):
+            k, end = np.int64(starts[i]), np.int64(ends[i])
+            while k < end:
                 j = np.int64(neighbors[k])
-                if j == i or first[j] == last[j]:
-                    continue
-                dx, dy, dz = xs[j] - xs[i], ys[j] - ys[i], zs[j] - zs[i]
-                if not (
-                    is_behind(contacts, sheet_of, i, dx, dy, dz)
-                    or is_behind(contacts, sheet_of, j, -dx, -dy, -dz)
-                ):
-                    continue
-                a, b = min(i, j), max(i, j)
-                if is_parted(sheets, motion, xs[a], ys[a], zs[a], xs[b], ys[b], zs[b]):
-                    neighbors[k] = i
-                    counts[i] -= 1
+                if has_between(sheets, motion, contacts, i, j, xs, ys, zs):
+                    end -= LANES
+                    neighbors[k], neighbors[end] = neighbors[end], i
+                else:
+                    k += LANES
+            ends[i] = end
 
 
 # ---------------------------------------------------------------- impulses

@@ -14,6 +14,7 @@ from numba import prange
 
 from sph_ros.core.jit import device, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.vector import LANES
 
 _TABLE = 256
 
@@ -152,7 +153,7 @@ def count_unbound(pairs, row_of_id, chunks, springs):
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, wanted.shape[0])):
             note_mates(i, springs, row_of_id, rows, place)
             count = 0
-            for k in range(pairs.start[i], pairs.end[i]):
+            for k in range(pairs.start[i], pairs.end[i], LANES):
                 j = np.int64(pairs.neighbors[k])
                 if j != i and not is_mate(j, place, rows, springs.count[i]):
                     count += 1
@@ -178,7 +179,7 @@ def bind_neighbors(positions, id_of_row, pairs, row_of_id, chunks, springs):
                 continue
             note_mates(i, springs, row_of_id, rows, place)
             cursor = count[i]
-            for k in range(pairs.start[i], pairs.end[i]):
+            for k in range(pairs.start[i], pairs.end[i], LANES):
                 j = np.int64(pairs.neighbors[k])
                 if j == i or count[j] + wanted[j] > slots:
                     continue

@@ -26,6 +26,7 @@ from numba import prange
 from sph_ros.core.contact_data import DISTANCE, GRADIENT, NORMAL, add_reaction
 from sph_ros.core.jit import device, parallel_kernel
 from sph_ros.core.neighbors import CHUNK, cell_coordinate
+from sph_ros.core.vector import LANES
 
 #: Cells of one support radius on each side of a particle's own that the reach covers.
 CELLS = 2
@@ -121,7 +122,7 @@ def spread_marks(pairs, marks, spread):
     """Mark in `spread` (N,) uint8 whoever has a neighbour with a mark."""
     for i in prange(marks.shape[0]):
         spread[i] = 0
-        for k in range(pairs.start[i], pairs.end[i]):
+        for k in range(pairs.start[i], pairs.end[i], LANES):
             if marks[pairs.neighbors[k]] != 0:
                 spread[i] = 1
                 break
@@ -185,7 +186,7 @@ def look_at_walls(i, positions, pairs, contacts, walls, reach, normals, solids):
     count, free = add_walls_of(
         i, i, positions, contacts, walls, reach, normals, solids, 0, np.float32(1.0)
     )
-    for k in range(pairs.start[i], pairs.end[i]):
+    for k in range(pairs.start[i], pairs.end[i], LANES):
         j = np.intp(pairs.neighbors[k])
         count, free = add_walls_of(
             i, j, positions, contacts, walls, reach, normals, solids, count, free

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vector instructions that LLVM does not find by itself, and what is needed to use them.
+"""Vectors of sixteen numbers as values in compiled functions.
+
+What is summed over neighbours is summed for sixteen particles at once, one in each lane. LLVM does
+not find such code by itself, so it is written down: numbers of type `Floats` and `Whole` add and
+multiply like any others, and `load`, `gather`, `store` move them. On processors without AVX-512
+LLVM makes several narrower instructions of each. Interpreted, vectors are numpy arrays.
 
 `append_within` appends the indices of near points. The search for neighbours compares some 200
 candidates for 30 hits; as a scalar loop that costs more than everything else in a step. Sixteen
@@ -8,210 +13,559 @@ compressing store where the processor has it (AVX-512), else by walking the set 
 comparison's mask. Both give the same list in the same order.
 """
 
+import operator
+
 import llvmlite.binding as llvm
+import numpy as np
 from llvmlite import ir
 from numba import config, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 
-#: Numba is told to interpret: the vector code becomes a plain loop.
+#: Numba is told to interpret.
 INTERPRETED = bool(config.DISABLE_JIT)
 
 HAS_COMPRESSING_STORE = bool(llvm.get_host_cpu_features().get("avx512f", False))
 
-#: Whether several values can be read from as many places by one instruction.
-HAS_GATHER = (
-    HAS_COMPRESSING_STORE
-    and bool(llvm.get_host_cpu_features().get("avx512vl", False))
-    and not INTERPRETED
-)
+#: Whether sixteen values can be read from as many places by one instruction.
+HAS_GATHER = HAS_COMPRESSING_STORE
 
 #: The same freedom as all other code has: see `core.jit`.
 FAST = ("reassoc", "contract", "nsz")
 
-_INT32, _FLOAT = ir.IntType(32), ir.FloatType()
-_BYTES = ir.IntType(8).as_pointer()
+_INT16, _INT32, _INT64, _FLOAT = ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType()
+_FLOATS, _WHOLE = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT32, LANES)
+_BITS = ir.VectorType(ir.IntType(1), LANES)
 
 
-class Vectors:
-    """Makes instructions on vectors of some width; gathering needs `HAS_GATHER`.
+# ---------------------------------------------------------------- types and their arithmetic
 
-    Args:
-        builder: of the function.
-        lanes: 8 or 16.
 
-    Attributes:
-        floats, ints: types of the vectors.
-    """
+class Floats(types.Type):
+    """Sixteen float32."""
 
-    def __init__(self, builder, lanes):
-        self._builder, self.lanes = builder, lanes
-        self.floats, self.ints = (ir.VectorType(kind, lanes) for kind in (_FLOAT, _INT32))
+    def __init__(self):
+        """There is one such type."""
+        super().__init__(name="Floats")
 
-    def constant(self, value, integer=False):
-        """A vector with the number `value` in every lane."""
-        return ir.Constant(self.ints if integer else self.floats, [value] * self.lanes)
 
-    def splat(self, value):
-        """A vector with `value` in every lane."""
-        vector_type = ir.VectorType(value.type, self.lanes)
-        empty = ir.Constant(vector_type, ir.Undefined)
-        first = self._builder.insert_element(empty, value, ir.Constant(_INT32, 0))
-        return self._builder.shuffle_vector(first, empty, self.constant(0, integer=True))
+class Whole(types.Type):
+    """Sixteen int32."""
 
-    def load(self, pointer, index, integer=False):
-        """The vector that begins at pointer[index]."""
-        kind = self.ints if integer else self.floats
-        place = self._builder.gep(pointer, [index])
-        vector = self._builder.load(self._builder.bitcast(place, kind.as_pointer()), typ=kind)
-        vector.align = 4
+    def __init__(self):
+        """There is one such type."""
+        super().__init__(name="Whole")
+
+
+class Truths(types.Type):
+    """Sixteen answers to a comparison."""
+
+    def __init__(self):
+        """There is one such type."""
+        super().__init__(name="Truths")
+
+
+floats, whole, truths = Floats(), Whole(), Truths()
+
+
+def _register(kind, backing):
+    @register_model(kind)
+    class Model(models.PrimitiveModel):
+        def __init__(self, manager, numba_type):
+            super().__init__(manager, numba_type, backing)
+
+
+for _kind, _backing in ((Floats, _FLOATS), (Whole, _WHOLE), (Truths, _BITS)):
+    _register(_kind, _backing)
+
+
+def _constant(value, kind=_FLOATS):
+    return ir.Constant(kind, [value] * LANES)
+
+
+def _splat(builder, value):
+    """A vector with a number in every lane; vectors stay what they are."""
+    if isinstance(value.type, ir.VectorType):
+        return value
+    vector = ir.VectorType(value.type, LANES)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, first, _constant(0, _WHOLE))
+
+
+def _define(function, kinds, result, make):
+    """Let `function` of values of numba types `kinds` be what `make(builder, *vectors)` returns."""
+
+    @lower_builtin(function, *kinds)
+    def lower(context, builder, sig, args):
+        values = [
+            context.cast(builder, value, given, types.int32)
+            if isinstance(given, types.Integer)
+            else value
+            for given, value in zip(sig.args, args, strict=True)
+        ]
+        return make(builder, *(_splat(builder, value) for value in values))
+
+    return signature(result, *kinds)
+
+
+def _register_operator(function, pairs, result, make):
+    cases_ = [_define(function, kinds, result, make) for kinds in pairs]
+
+    @infer_global(function)
+    class Operator(ConcreteTemplate):
+        cases = cases_
+
+
+_WITH_FLOATS = [(floats, floats), (floats, types.float32), (types.float32, floats)]
+_WITH_WHOLE = [(whole, whole), (whole, types.int64)]
+
+for _function, _name in (
+    (operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"),
+    (operator.iadd, "fadd"), (operator.isub, "fsub"), (operator.imul, "fmul"),
+):  # fmt: skip
+    _register_operator(
+        _function, _WITH_FLOATS, floats,
+        lambda builder, a, b, name=_name: getattr(builder, name)(a, b, flags=FAST),
+    )  # fmt: skip
+_register_operator(operator.truediv, _WITH_FLOATS, floats, lambda builder, a, b: builder.fdiv(a, b))
+for _function, _name in (
+    (operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul"), (operator.and_, "and_"),
+    (operator.or_, "or_"), (operator.lshift, "shl"), (operator.rshift, "ashr"),
+):  # fmt: skip
+    _register_operator(
+        _function, _WITH_WHOLE, whole,
+        lambda builder, a, b, name=_name: getattr(builder, name)(a, b),
+    )  # fmt: skip
+for _function, _sign in ((operator.lt, "<"), (operator.gt, ">")):
+    _register_operator(
+        _function, _WITH_FLOATS, truths,
+        lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b),
+    )  # fmt: skip
+    _register_operator(
+        _function, _WITH_WHOLE, truths,
+        lambda builder, a, b, sign=_sign: builder.icmp_signed(sign, a, b),
+    )  # fmt: skip
+for _function, _name in ((operator.or_, "or_"), (operator.and_, "and_")):
+    _register_operator(
+        _function, [(truths, truths)], truths,
+        lambda builder, a, b, name=_name: getattr(builder, name)(a, b),
+    )  # fmt: skip
+
+
+def _operation(kinds, result, make, plainly):
+    """A function of vectors; see `_define`. Interpreted it is `plainly`."""
+    if INTERPRETED:
+        return plainly
+
+    @intrinsic
+    def one(typingctx, a):
+        return signature(result, *kinds), generate
+
+    @intrinsic
+    def two(typingctx, a, b):
+        return signature(result, *kinds), generate
+
+    @intrinsic
+    def three(typingctx, a, b, c):
+        return signature(result, *kinds), generate
+
+    def generate(context, builder, sig, args):
+        return make(builder, *(_splat(builder, value) for value in args))
+
+    return (one, two, three)[len(kinds) - 1]
+
+
+def _call(builder, name, result, *args):
+    """Call an intrinsic function of LLVM."""
+    kinds = [value.type for value in args]
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(result, kinds), f"llvm.{name}"
+    )
+    return builder.call(function, args)
+
+
+def _larger(builder, a, b):
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
+#: A vector with one float32 in every lane.
+spread = _operation(
+    (types.float32,), floats, lambda builder, a: a, lambda a: np.full(LANES, a, np.float32)
+)
+#: The larger one of two, lane by lane; where one is no number the second. The smaller one.
+larger = _operation(
+    (floats, floats), floats, _larger, lambda a, b: np.where(a > b, a, b).astype(np.float32)
+)
+smaller = _operation(
+    (floats, floats),
+    floats,
+    lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b),
+    lambda a, b: np.where(a < b, a, b).astype(np.float32),
+)
+#: Of two vectors the first one's lanes where something is true, else the second one's.
+where = _operation(
+    (truths, floats, floats),
+    floats,
+    lambda builder, which, a, b: builder.select(which, a, b),
+    lambda which, a, b: np.where(which, a, b).astype(np.float32),
+)
+where_whole = _operation(
+    (truths, whole, whole),
+    whole,
+    lambda builder, which, a, b: builder.select(which, a, b),
+    np.where,
+)
+#: Square roots.
+root = _operation(
+    (floats,), floats, lambda builder, a: _call(builder, "sqrt.v16f32", _FLOATS, a), np.sqrt
+)
+
+
+def _inverse_root(builder, a):
+    if not HAS_COMPRESSING_STORE:
+        return builder.fdiv(_constant(1.0), _call(builder, "sqrt.v16f32", _FLOATS, a))
+    # Right to 14 bits, and after a step of Newton's to all but the last one or two.
+    kinds = [_FLOATS, _FLOATS, ir.IntType(16)]
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(_FLOATS, kinds), "llvm.x86.avx512.rsqrt14.ps.512"
+    )
+    everything = ir.Constant(kinds[2], 0xFFFF)
+    near = builder.call(function, [a, ir.Constant(_FLOATS, None), everything])
+    half = builder.fmul(builder.fmul(a, near, flags=FAST), _constant(0.5), flags=FAST)
+    left = builder.fsub(_constant(1.5), builder.fmul(half, near, flags=FAST), flags=FAST)
+    return builder.fmul(near, left, flags=FAST)
+
+
+#: One over the square root, for positive numbers.
+inverse_root = _operation(
+    (floats,), floats, _inverse_root, lambda a: (np.float32(1.0) / np.sqrt(a)).astype(np.float32)
+)
+magnitude = _operation(
+    (floats,), floats, lambda builder, a: _call(builder, "fabs.v16f32", _FLOATS, a), np.abs
+)
+#: Whole numbers as floats; floats rounded to the nearest whole number, to the even one of two.
+as_floats = _operation(
+    (whole,),
+    floats,
+    lambda builder, a: builder.sitofp(a, _FLOATS),
+    lambda a: a.astype(np.float32),
+)
+rounded = _operation(
+    (floats,),
+    whole,
+    lambda builder, a: builder.fptosi(_call(builder, "rint.v16f32", _FLOATS, a), _WHOLE),
+    lambda a: np.rint(a).astype(np.int32),
+)
+
+
+def _sum(builder, vector):
+    """Lanes added in a tree, always the same one."""
+    count = LANES
+    while count > 1:
+        count //= 2
+        halves = [
+            builder.shuffle_vector(
+                vector,
+                vector,
+                ir.Constant(ir.VectorType(_INT32, count), list(range(low, low + count))),
+            )
+            for low in (0, count)
+        ]
+        vector = builder.fadd(*halves, flags=FAST)
+    return builder.extract_element(vector, ir.Constant(_INT32, 0))
+
+
+#: Sum over the lanes.
+total = _operation((floats,), types.float32, _sum, lambda a: a.sum(dtype=np.float32))
+
+
+# ---------------------------------------------------------------- memory
+
+
+def data_pointer(context, builder, array_type, array):
+    """Address of the first element of a C-contiguous array."""
+    return context.make_array(array_type)(context, builder, array).data
+
+
+def _shape(context, builder, array_type, array, axis):
+    view = context.make_array(array_type)(context, builder, array)
+    return cgutils.unpack_tuple(builder, view.shape, array_type.ndim)[axis]
+
+
+def _lane(builder, vector, lane):
+    return builder.extract_element(vector, ir.Constant(_INT32, lane))
+
+
+def _gather(builder, pointer, indices):
+    """Elements of 4 bytes, floats or integers, as a vector; indices are read as signed."""
+    element = pointer.type.pointee if hasattr(pointer.type, "pointee") else _FLOAT
+    vector = ir.VectorType(element, LANES)
+    if HAS_GATHER:
+        kinds = [_FLOATS, ir.IntType(8).as_pointer(), _WHOLE, _BITS, _INT32]
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(_FLOATS, kinds), "llvm.x86.avx512.mask.gather.dps.512"
+        )
+        place = builder.bitcast(pointer, kinds[1])
+        everything = ir.Constant(_BITS, [1] * LANES)
+        found = builder.call(
+            function,
+            [ir.Constant(_FLOATS, None), place, indices, everything, ir.Constant(_INT32, 4)],
+        )
+        return builder.bitcast(found, vector)
+    found = ir.Constant(vector, ir.Undefined)
+    for lane in range(LANES):
+        index = builder.sext(_lane(builder, indices, lane), _INT64)
+        found = builder.insert_element(
+            found, builder.load(builder.gep(pointer, [index])), ir.Constant(_INT32, lane)
+        )
+    return found
+
+
+def _load(builder, pointer, index, count=LANES):
+    """A vector of what begins at pointer[index]."""
+    kind = ir.VectorType(pointer.type.pointee, count)
+    place = builder.bitcast(builder.gep(pointer, [index]), kind.as_pointer())
+    vector = builder.load(place)
+    vector.align = pointer.type.pointee.width // 8 if kind.element != _FLOAT else 4
+    return vector
+
+
+def _store(builder, vector, pointer, index):
+    place = builder.bitcast(builder.gep(pointer, [index]), vector.type.as_pointer())
+    builder.store(vector, place).align = 2 if vector.type.element == _INT16 else 4
+
+
+@intrinsic
+def _load_compiled(typingctx, array, index):
+    result = whole if array.dtype in (types.int32, types.uint32) else floats
+
+    def generate(context, builder, sig, args):
+        vector = _load(builder, data_pointer(context, builder, sig.args[0], args[0]), args[1])
+        if sig.args[0].dtype == types.int16:
+            return builder.sitofp(builder.sext(vector, _WHOLE), _FLOATS)
         return vector
 
-    def store(self, vector, pointer, index):
-        """Write a vector to where pointer[index] is."""
-        place = self._builder.gep(pointer, [index])
-        self._builder.store(
-            vector, self._builder.bitcast(place, vector.type.as_pointer())
-        ).align = 4
-
-    def gather(self, pointer, indices):
-        """Elements pointer[indices] of 4 bytes, as floats."""
-        name = {8: "avx512.mask.gather3siv8.sf", 16: "avx512.mask.gather.dps.512"}[self.lanes]
-        return self._gather(name, self.floats, pointer, indices, 4)
-
-    def gather_words(self, pointer, indices):
-        """Elements pointer[indices] of 8 bytes as two vectors, lower and upper half of each."""
-        words, builder = ir.VectorType(ir.IntType(64), 8), self._builder
-        pair = ir.VectorType(_INT32, 16)
-        pieces = []
-        for first in range(0, self.lanes, 8):
-            lanes = ir.Constant(ir.VectorType(_INT32, 8), list(range(first, first + 8)))
-            part = builder.shuffle_vector(indices, ir.Constant(self.ints, ir.Undefined), lanes)
-            found = self._gather("avx512.mask.gather.dpq.512", words, pointer, part, 8)
-            pieces.append(builder.bitcast(found, pair))
-        pieces.append(ir.Constant(pair, ir.Undefined))
-        return [
-            builder.shuffle_vector(
-                *pieces[:2], ir.Constant(self.ints, list(range(which, 2 * self.lanes, 2)))
-            )
-            for which in (0, 1)
-        ]
-
-    def _gather(self, name, kind, pointer, indices, size):
-        bits = ir.VectorType(ir.IntType(1), kind.count)
-        arguments = [kind, _BYTES, indices.type, bits, _INT32]
-        function = cgutils.get_or_insert_function(
-            self._builder.module, ir.FunctionType(kind, arguments), f"llvm.x86.{name}"
-        )
-        nothing, everything = ir.Constant(kind, None), ir.Constant(bits, [1] * kind.count)
-        place = self._builder.bitcast(pointer, _BYTES)
-        return self._builder.call(
-            function, [nothing, place, indices, everything, ir.Constant(_INT32, size)]
-        )
-
-    def multiply_add(self, a, b, c):
-        """A b + c, fused where the processor can."""
-        return self._builder.fadd(self._builder.fmul(a, b, flags=FAST), c, flags=FAST)
-
-    def square_root(self, vector):
-        """Square roots of a vector of floats."""
-        function = cgutils.get_or_insert_function(
-            self._builder.module,
-            ir.FunctionType(self.floats, [self.floats]),
-            f"llvm.sqrt.v{self.lanes}f32",
-        )
-        return self._builder.call(function, [vector])
-
-    def positive(self, vector):
-        """The floats of a vector, 0 instead of those that are less."""
-        zero = self.constant(0.0)
-        above = self._builder.fcmp_ordered(">", vector, zero)
-        return self._builder.select(above, vector, zero)
-
-    def sum(self, vector):
-        """Sum over the lanes of a vector of floats."""
-        function = cgutils.get_or_insert_function(
-            self._builder.module,
-            ir.FunctionType(_FLOAT, [_FLOAT, self.floats]),
-            f"llvm.vector.reduce.fadd.v{self.lanes}f32",
-        )
-        return self._builder.call(function, [ir.Constant(_FLOAT, -0.0), vector], fastmath=FAST)
+    return signature(result, array, types.intp), generate
 
 
-def data_pointer(context, builder, array_type, array, row=None):
-    """Address of the first element of a C-contiguous array, or of a row of one with two axes."""
-    view = context.make_array(array_type)(context, builder, array)
-    if row is None:
-        return view.data
-    length = cgutils.unpack_tuple(builder, view.shape, array_type.ndim)[-1]
-    return builder.gep(view.data, [builder.mul(length, ir.Constant(length.type, row))])
-
-
-def sums_in_vectors(builder, start, end, count, body):
-    """Sums of `count` terms over start, start + 1, ... end - 1, a multiple of 8 indices.
-
-    Sixteen are taken at a time, and eight at the end where so many are left.
-
-    Args:
-        builder: of the function.
-        start, end: indices.
-        count: of sums.
-        body: called with Vectors, an index, and the vectors of sums so far; returns the new ones.
-
-    Returns:
-        The sums, floats.
-    """
-    wide, narrow = Vectors(builder, 16), Vectors(builder, 8)
-    entry = builder.block
-    head, between, tail, done = (
-        builder.append_basic_block(f"sums.{name}") for name in ("head", "between", "tail", "done")
+def _load_plainly(array, index):
+    values = array[index : index + LANES]
+    return values.astype(
+        np.int32 if array.dtype.kind in "iu" and array.itemsize == 4 else np.float32
     )
-    step = ir.Constant(start.type, 16)
-    whole = builder.add(start, builder.and_(builder.sub(end, start), ir.Constant(start.type, -16)))
-    builder.cbranch(builder.icmp_signed("<", start, whole), head, between)
 
-    builder.position_at_end(head)
-    index = builder.phi(start.type)
-    index.add_incoming(start, entry)
-    sums = [builder.phi(wide.floats) for _ in range(count)]
-    for value in sums:
-        value.add_incoming(wide.constant(0.0), entry)
-    new = body(wide, index, sums)
-    following, last = builder.add(index, step), builder.block
-    index.add_incoming(following, last)
-    for value, changed in zip(sums, new, strict=True):
-        value.add_incoming(changed, last)
-    builder.cbranch(builder.icmp_signed("<", following, whole), head, between)
 
-    builder.position_at_end(between)
-    halves = []
-    for changed in new:
-        so_far = builder.phi(wide.floats)
-        so_far.add_incoming(wide.constant(0.0), entry)
-        so_far.add_incoming(changed, last)
-        halves.append(so_far)
-    parts = [ir.Constant(narrow.ints, list(range(first, first + 8))) for first in (0, 8)]
-    halves = [
-        builder.fadd(*(builder.shuffle_vector(value, value, part) for part in parts), flags=FAST)
-        for value in halves
+@intrinsic
+def _store_compiled(typingctx, vector, array, index):
+    def generate(context, builder, sig, args):
+        value = args[0]
+        if sig.args[1].dtype == types.int16:
+            value = _call(builder, "rint.v16f32", _FLOATS, value)
+            value = builder.trunc(builder.fptosi(value, _WHOLE), ir.VectorType(_INT16, LANES))
+        _store(builder, value, data_pointer(context, builder, sig.args[1], args[1]), args[2])
+        return context.get_dummy_value()
+
+    return signature(types.void, vector, array, types.intp), generate
+
+
+def _store_plainly(vector, array, index):
+    array[index : index + LANES] = np.rint(vector) if array.dtype == np.int16 else vector
+
+
+@intrinsic
+def _gather_compiled(typingctx, array, indices):
+    def generate(context, builder, sig, args):
+        return _gather(builder, data_pointer(context, builder, sig.args[0], args[0]), args[1])
+
+    return signature(whole if array.dtype != types.float32 else floats, array, whole), generate
+
+
+def _gather_plainly(array, indices):
+    return array[indices] if array.dtype == np.float32 else array[indices].astype(np.int32)
+
+
+@intrinsic
+def _gather_words_compiled(typingctx, array, indices):
+    def generate(context, builder, sig, args):
+        # Each word is two elements of 4 bytes.
+        place = data_pointer(context, builder, sig.args[0], args[0])
+        return context.make_tuple(builder, sig.return_type, _words(builder, place, args[1]))
+
+    return signature(types.UniTuple(whole, 2), array, whole), generate
+
+
+def _words(builder, place, indices):
+    if not HAS_GATHER:
+        place = builder.bitcast(place, _INT32.as_pointer())
+        double = builder.shl(indices, _constant(1, _WHOLE))
+        return [
+            _gather(builder, place, builder.or_(double, _constant(half, _WHOLE))) for half in (0, 1)
+        ]
+    eight, bits = ir.VectorType(_INT64, 8), ir.VectorType(ir.IntType(1), 8)
+    kinds = [eight, ir.IntType(8).as_pointer(), ir.VectorType(_INT32, 8), bits, _INT32]
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(eight, kinds), "llvm.x86.avx512.mask.gather.dpq.512"
+    )
+    place, pieces = builder.bitcast(place, kinds[1]), []
+    for first in (0, 8):
+        lanes = ir.Constant(kinds[2], list(range(first, first + 8)))
+        part = builder.shuffle_vector(indices, indices, lanes)
+        arguments = [ir.Constant(eight, None), place, part, ir.Constant(bits, [1] * 8)]
+        found = builder.call(function, [*arguments, ir.Constant(_INT32, 8)])
+        pieces.append(builder.bitcast(found, _WHOLE))
+    return [
+        builder.shuffle_vector(*pieces, ir.Constant(_WHOLE, list(range(half, 2 * LANES, 2))))
+        for half in (0, 1)
     ]
-    builder.cbranch(builder.icmp_signed("<", whole, end), tail, done)
 
-    builder.position_at_end(tail)
-    new = body(narrow, whole, halves)
-    last = builder.block
-    builder.branch(done)
 
-    builder.position_at_end(done)
-    results = []
-    for before, after in zip(halves, new, strict=True):
-        result = builder.phi(narrow.floats)
-        result.add_incoming(before, between)
-        result.add_incoming(after, last)
-        results.append(result)
-    return [narrow.sum(result) for result in results]
+def _gather_words_plainly(array, indices):
+    halves = np.ascontiguousarray(array[indices]).view(np.int32).reshape(-1, 2)
+    return halves[:, 0], halves[:, 1]
+
+
+@intrinsic
+def _lanes_compiled(typingctx, first, count):
+    def generate(context, builder, sig, args):
+        start, last = (builder.trunc(value, _INT32) for value in args)
+        last = _splat(builder, builder.sub(last, ir.Constant(_INT32, 1)))
+        indices = builder.add(_splat(builder, start), ir.Constant(_WHOLE, list(range(LANES))))
+        return builder.select(builder.icmp_signed("<", indices, last), indices, last)
+
+    return signature(whole, types.intp, types.intp), generate
+
+
+def _lanes_plainly(first, count):
+    return np.minimum(np.arange(first, first + LANES), count - 1).astype(np.int32)
+
+
+@intrinsic
+def _take_compiled(typingctx, array, row):
+    def generate(context, builder, sig, args):
+        array_, row_ = args
+        place = data_pointer(context, builder, sig.args[0], array_)
+        count = _shape(context, builder, sig.args[0], array_, 0)
+        whole_ = ir.VectorType(place.type.pointee, LANES)
+        result = cgutils.alloca_once(builder, whole_)
+        fits = builder.icmp_signed("<=", builder.add(row_, ir.Constant(row_.type, LANES)), count)
+        with builder.if_else(fits, likely=True) as (all_rows, some):
+            with all_rows:
+                builder.store(_load(builder, place, row_), result)
+            with some:
+                last = builder.trunc(builder.sub(count, ir.Constant(count.type, 1)), _INT32)
+                first = _splat(builder, builder.trunc(row_, _INT32))
+                indices = builder.add(first, ir.Constant(_WHOLE, list(range(LANES))))
+                inside = builder.icmp_signed("<", indices, _splat(builder, last))
+                indices = builder.select(inside, indices, _splat(builder, last))
+                builder.store(_gather(builder, place, indices), result)
+        return builder.load(result)
+
+    result = floats if array.dtype == types.float32 else whole
+    return signature(result, array, types.intp), generate
+
+
+def _take_plainly(array, row):
+    return _gather_plainly(array, _lanes_plainly(row, len(array)))
+
+
+def _interleaved(builder, columns):
+    """Vectors that hold the lanes of the given ones in turn: a0 b0 c0 a1 b1 c1 ..."""
+    width = len(columns)
+    for piece in range(width):
+        places = [divmod(LANES * piece + lane, width) for lane in range(LANES)]
+        vector = columns[0]
+        # Lane by lane from the vector made so far, or from the next column.
+        for number, column in enumerate(columns):
+            take = [
+                (LANES + row) if which == number else lane
+                for lane, (row, which) in enumerate(places)
+            ]
+            vector = builder.shuffle_vector(vector, column, ir.Constant(_WHOLE, take))
+        yield vector
+
+
+@intrinsic
+def _put_compiled(typingctx, vectors, array, row):
+    width = len(vectors) if isinstance(vectors, types.BaseTuple) else 1
+
+    def generate(context, builder, sig, args):
+        vectors_, array_, row_ = args
+        columns = cgutils.unpack_tuple(builder, vectors_) if width > 1 else [vectors_]
+        place = data_pointer(context, builder, sig.args[1], array_)
+        place = builder.bitcast(place, columns[0].type.element.as_pointer())
+        count = _shape(context, builder, sig.args[1], array_, 0)
+        begin = builder.mul(row_, ir.Constant(row_.type, width))
+        fits = builder.icmp_signed("<=", builder.add(row_, ir.Constant(row_.type, LANES)), count)
+        with builder.if_else(fits, likely=True) as (all_rows, some):
+            with all_rows:
+                for piece, vector in enumerate(_interleaved(builder, columns)):
+                    offset = ir.Constant(row_.type, LANES * piece)
+                    _store(builder, vector, place, builder.add(begin, offset))
+            with some:
+                left = builder.sub(count, row_)
+                for lane in range(LANES):
+                    inside = builder.icmp_signed("<", ir.Constant(row_.type, lane), left)
+                    with builder.if_then(inside):
+                        for which, column in enumerate(columns):
+                            offset = ir.Constant(row_.type, width * lane + which)
+                            target = builder.gep(place, [builder.add(begin, offset)])
+                            builder.store(_lane(builder, column, lane), target)
+        return context.get_dummy_value()
+
+    return signature(types.void, vectors, array, types.intp), generate
+
+
+def _put_plainly(vectors, array, row):
+    count = min(LANES, len(array) - row)
+    if array.dtype == np.int64:
+        low, high = (vector[:count].astype(np.int64) for vector in vectors)
+        array[row : row + count] = (high << 32) | (low & 0xFFFFFFFF)
+    elif array.ndim == 1:
+        array[row : row + count] = vectors[:count]
+    else:
+        array[row : row + count] = np.stack(vectors, axis=1)[:count]
+
+
+#: load(array, index): the sixteen elements from an index on. Those of int16 arrays become floats.
+load = _load_plainly if INTERPRETED else _load_compiled
+#: store(vector, array, index): the inverse; rounds for an int16 array.
+store = _store_plainly if INTERPRETED else _store_compiled
+#: gather(array, indices): elements of a contiguous array, from any places; float32, int32, uint32.
+gather = _gather_plainly if INTERPRETED else _gather_compiled
+#: gather_words(array, indices): elements of an int64 array as two vectors, lower and upper halves.
+gather_words = _gather_words_plainly if INTERPRETED else _gather_words_compiled
+#: lanes_from(first, count): first, first + 1, ..., but at most count - 1.
+lanes_from = _lanes_plainly if INTERPRETED else _lanes_compiled
+#: take(array, row): the elements of a (N,) array from a row on; beyond the last one that again.
+take = _take_plainly if INTERPRETED else _take_compiled
+#: put(vectors, array, row): write a vector to the rows from `row` on of a (N,) array; of (x, y, z)
+#: to an (N, 3) array; (low, high) to an (N,) int64 array. Only rows that there are.
+put = _put_plainly if INTERPRETED else _put_compiled
+
+
+def _gather_column_plainly(array, indices, column):
+    return array[indices, column]
+
+
+@intrinsic
+def _gather_column_compiled(typingctx, array, indices, column):
+    def generate(context, builder, sig, args):
+        array_, indices_, column_ = args
+        width = builder.trunc(_shape(context, builder, sig.args[0], array_, 1), _INT32)
+        place = builder.gep(data_pointer(context, builder, sig.args[0], array_), [column_])
+        return _gather(builder, place, builder.mul(indices_, _splat(builder, width)))
+
+    return signature(floats, array, whole, types.intp), generate
+
+
+#: gather_column(array, indices, column): elements [indices, column] of an (N, K) float32 array.
+gather_column = _gather_column_plainly if INTERPRETED else _gather_column_compiled
+
+
+# ---------------------------------------------------------------- near points
 
 
 def _store_set_bits(builder, bits, first, pointer, cursor):
@@ -256,33 +610,35 @@ def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cu
 
     def codegen(context, builder, sig, args):
         xs_, ys_, zs_, begin_, end_, x_, y_, z_, square_, target_, cursor_ = args
-        vectors, total = Vectors(builder, LANES), None
+        distance = None
         for array_type, array, centre in zip(
             sig.args[:3], (xs_, ys_, zs_), (x_, y_, z_), strict=True
         ):
-            values = vectors.load(data_pointer(context, builder, array_type, array), begin_)
-            offset = builder.fsub(vectors.splat(centre), values)
+            values = _load(builder, data_pointer(context, builder, array_type, array), begin_)
+            offset = builder.fsub(_splat(builder, centre), values)
             term = builder.fmul(offset, offset, flags=("contract",))
-            total = term if total is None else builder.fadd(total, term, flags=("contract",))
-        near = builder.fcmp_ordered("<", total, vectors.splat(square_))
-        lanes = ir.Constant(vectors.ints, list(range(LANES)))
-        room = builder.trunc(builder.sub(end_, begin_), ir.IntType(32))
-        mask = builder.and_(near, builder.icmp_signed("<", lanes, vectors.splat(room)))
-        bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(32))
-        first = builder.trunc(begin_, ir.IntType(32))
+            distance = (
+                term if distance is None else builder.fadd(distance, term, flags=("contract",))
+            )
+        near = builder.fcmp_ordered("<", distance, _splat(builder, square_))
+        lanes = ir.Constant(_WHOLE, list(range(LANES)))
+        room = builder.trunc(builder.sub(end_, begin_), _INT32)
+        mask = builder.and_(near, builder.icmp_signed("<", lanes, _splat(builder, room)))
+        bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), _INT32)
+        first = builder.trunc(begin_, _INT32)
         target_data = data_pointer(context, builder, sig.args[9], target_)
         target_pointer = builder.gep(target_data, [cursor_])
         if HAS_COMPRESSING_STORE:
-            indices = builder.add(lanes, vectors.splat(first))
+            indices = builder.add(lanes, _splat(builder, first))
             # In a register and then stored whole: the instruction that stores only the hits is
             # several times slower.
             compress = cgutils.get_or_insert_function(
                 builder.module,
-                ir.FunctionType(vectors.ints, [vectors.ints, vectors.ints, near.type]),
+                ir.FunctionType(_WHOLE, [_WHOLE, _WHOLE, near.type]),
                 f"llvm.x86.avx512.mask.compress.v{LANES}i32",
             )
-            hits = builder.call(compress, [indices, vectors.constant(0, integer=True), mask])
-            vectors.store(hits, target_pointer, ir.Constant(cursor_.type, 0))
+            hits = builder.call(compress, [indices, _constant(0, _WHOLE), mask])
+            _store(builder, hits, target_pointer, ir.Constant(cursor_.type, 0))
             count = builder.ctpop(bits)
             return builder.add(cursor_, builder.zext(count, cursor_.type))
         return _store_set_bits(builder, bits, first, target_pointer, cursor_)

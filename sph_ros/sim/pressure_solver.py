@@ -193,8 +193,7 @@ class PressureSolver(Solver):
         """How strongly the liquid rubs in a substep, `Rates`."""
         scales, friction = self.scales, self._material.wall_friction
         return Rates(
-            power=self._power,
-            slope=self._power * scales.density_scale * self._packing / float(self._h),
+            support_radius=self._scene.support_radius,
             linear=scales.viscous_rate * time_step,
             quadratic=scales.quadratic * time_step,
             neighbors=scales.neighbors,

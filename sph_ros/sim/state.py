@@ -4,12 +4,16 @@
 import numpy as np
 
 from sph_ros.core.contacts import TERMS, Contacts
-from sph_ros.core.neighbors import CHUNK, Grid, Pairs, Sums, chunk_count
+from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count
+from sph_ros.core.pair_sums import Pairs
 from sph_ros.core.vector import LANES
 
 #: Cells of a grid; beyond, its outermost cells hold what lies farther out.
 MOST_CELLS_PER_PARTICLE = 8
 MOST_CELLS_AT_LEAST = 1 << 16
+
+#: [bytes]
+CACHE_LINE = 64
 
 #: What the names of a fluid's extras begin with in a snapshot.
 EXTRA = "extra_"
@@ -243,16 +247,20 @@ class Workspace:
         room = max(chunk_count(self.capacity), 1) * CHUNK * per_particle
         self.pairs_per_particle = per_particle
         self._pairs = Pairs(
-            np.zeros(self.capacity, np.int64),
-            np.zeros(self.capacity, np.int64),
-            np.zeros(self.capacity, np.int32),
-            np.empty(room, np.uint32),
-            np.empty((4, room), np.float32),
+            start=np.zeros(self.capacity, np.int32),
+            end=np.zeros(self.capacity, np.int32),
+            stop=np.zeros(-(-self.capacity // LANES), np.int32),
+            neighbors=aligned(room, np.uint32),
+            **{name: aligned(room, np.int16) for name in ("x", "y", "z", "nearness")},
+            unit=np.zeros(1, np.float32),
         )
 
     def _fit_pairs(self):
-        lists = {name: getattr(self._pairs, name)[: self.count] for name in Pairs._fields[:3]}
-        self.pairs = self._pairs._replace(**lists)
+        self.pairs = self._pairs._replace(
+            start=self._pairs.start[: self.count],
+            end=self._pairs.end[: self.count],
+            stop=self._pairs.stop[: -(-self.count // LANES)],
+        )
 
     def enlarge_pairs(self):
         """More room for neighbours, after a search that found too little."""
@@ -262,6 +270,14 @@ class Workspace:
 
 #: Fields of `Contacts` with a row per particle.
 _PER_PARTICLE = ("start", "end", "density", "gradients")
+
+
+def aligned(count, kind):
+    """An array that begins where a line of the cache does, as vectors are read fastest."""
+    size = np.dtype(kind).itemsize
+    memory = np.empty(count * size + CACHE_LINE, np.uint8)
+    first = -memory.ctypes.data % CACHE_LINE
+    return memory[first : first + count * size].view(kind)
 
 
 def make_grid(lower, upper, cell, count):

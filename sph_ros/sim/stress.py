@@ -18,6 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sph_ros.core.pair_sums import STEPS
+from sph_ros.core.vector import LANES
+
 
 class Weights(NamedTuple):
     """How pressures act along pairs.
@@ -82,8 +85,8 @@ def walls_share(power, support_radius, spacing, dimension):
 
 def pair_lists(pairs):
     """All pairs, each from both sides: row (M,), neighbour (M,), 1 - r/h (M,)."""
-    counts = pairs.end - pairs.start
+    counts = (pairs.end - pairs.start) // LANES
     rows = np.repeat(np.arange(len(counts)), counts)
-    first = np.repeat(pairs.start - (np.cumsum(counts) - counts), counts)
-    places = first + np.arange(len(rows))
-    return rows, pairs.neighbors[places].astype(np.int64), pairs.gradients[3, places]
+    number = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = pairs.start[rows] + LANES * number
+    return rows, pairs.neighbors[places].astype(np.int64), pairs.nearness[places] / STEPS

@@ -22,8 +22,7 @@ class Rates(NamedTuple):
     """How strongly liquid rubs on itself and on solids in one step.
 
     Attributes:
-        power: of the density's weight (1 - r/h)^power.
-        slope: length of a pair's gradient divided by (1 - r/h)^(power - 1) [1/m].
+        support_radius: h [m].
         linear: impulse per relative speed [-].
         quadratic: impulse per squared relative speed [s/m].
         neighbors: (1 - r/h) summed over the neighbours in a lattice, by the dimension [-].
@@ -32,8 +31,7 @@ class Rates(NamedTuple):
         inertia: particle mass / time step [kg/s].
     """
 
-    power: int
-    slope: float
+    support_radius: float
     linear: float
     quadratic: float
     neighbors: float
@@ -61,12 +59,12 @@ def apply_viscosity(work, velocities, rates, motion):
     if rates.quadratic > 0.0 or (rates.linear > 0.0 and not implicit):
         relax.viscous_impulses(
             work.pairs,
+            work.columns,
             velocities,
-            np.float32(rates.slope),
+            np.float32(rates.support_radius),
             np.float32(0.0 if implicit else rates.linear),
             np.float32(rates.quadratic),
             np.float32(MOST_TAKEN / rates.neighbors),
-            np.float32(rates.power),
             work.scratch,
         )
         velocities[:] = work.scratch
@@ -100,16 +98,14 @@ def apply_viscosity(work, velocities, rates, motion):
 def _solve_implicitly(work, velocities, rates, touching):
     """Conjugate gradients for v - impulses(v) = present v, starting from the present v."""
     direction, image, residual = work.cohesive, work.scratch, work.displacements
-    slope, linear, wall, power = (
-        np.float32(x) for x in (rates.slope, rates.linear, rates.wall, rates.power)
-    )
+    reach, linear, wall = (np.float32(x) for x in (rates.support_radius, rates.linear, rates.wall))
 
     def dot(a, b):
         relax.chunk_dots(a, b, work.errors)
         return float(work.errors.sum())
 
     def apply(v, moving):
-        relax.viscous_operator(work.pairs, v, slope, linear, power, image)
+        relax.viscous_operator(work.pairs, work.columns, v, reach, linear, image)
         if touching:
             add_drag(work.contacts, wall, np.float32(moving), v, image)
 
