@@ -187,23 +187,22 @@ def _call(builder, name, result, *args):
     return builder.call(function, args)
 
 
-def _larger(builder, a, b):
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-
 #: A vector with one float32 in every lane.
 spread = _operation(
     (types.float32,), floats, lambda builder, a: a, lambda a: np.full(LANES, a, np.float32)
 )
-#: The larger one of two, lane by lane; where one is no number the second. The smaller one.
+#: The larger one of two, lane by lane, and the smaller one. If the first is no number, that stays.
 larger = _operation(
-    (floats, floats), floats, _larger, lambda a, b: np.where(a > b, a, b).astype(np.float32)
+    (floats, floats),
+    floats,
+    lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), b, a),
+    lambda a, b: np.where(a < b, b, a).astype(np.float32),
 )
 smaller = _operation(
     (floats, floats),
     floats,
-    lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b),
-    lambda a, b: np.where(a < b, a, b).astype(np.float32),
+    lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), b, a),
+    lambda a, b: np.where(a > b, b, a).astype(np.float32),
 )
 #: Of two vectors the first one's lanes where something is true, else the second one's.
 where = _operation(
