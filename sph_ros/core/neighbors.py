@@ -123,6 +123,15 @@ def bounding_box(positions, lower, upper):
     return -1
 
 
+def farthest_coordinates(positions):
+    """Largest absolute x, y and z of `positions` (N, 3) [m]; 0 where there are none."""
+    if not len(positions):
+        return 0.0, 0.0, 0.0
+    lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
+    bounding_box(positions, lower, upper)
+    return tuple(np.maximum(np.abs(lower), np.abs(upper)).tolist())
+
+
 @kernel
 def sort_by_cell(positions, grid, cell_of, order):
     """Stable counting sort of particles by cell.
@@ -166,6 +175,13 @@ def gather_rows(order, source, target):
         target[k, 0] = source[i, 0]
         target[k, 1] = source[i, 1]
         target[k, 2] = source[i, 2]
+
+
+@parallel_kernel
+def gather_values(order, source, target):
+    """target[k] = source[order[k]] for (N,) arrays."""
+    for k in prange(order.shape[0]):
+        target[k] = source[order[k]]
 
 
 @parallel_kernel

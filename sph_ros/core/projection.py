@@ -153,7 +153,7 @@ def density_targets(
 
 
 @parallel_kernel
-def move(positions, free, displacements, longest, inverse_step, ends, velocities):
+def move(positions, free, displacements, longest, inverse_step, ends, wanted, origins, velocities):
     """Positions and velocities after a step.
 
     Velocities get only what the pressures changed: velocities from positions would lose digits, and
@@ -165,7 +165,8 @@ def move(positions, free, displacements, longest, inverse_step, ends, velocities
         displacements: with pressure [m], (N, 3).
         longest: displacements are cut at this length [m], float32.
         inverse_step: 1 / dt [1/s], float32.
-        ends: [m], (N, 3); written.
+        ends, wanted: where the particles get to [m], (N, 3); written.
+        origins: the positions once more; written.
         velocities: those of `free` [m/s], (N, 3); changed.
     """
     for i in prange(positions.shape[0]):
@@ -176,16 +177,17 @@ def move(positions, free, displacements, longest, inverse_step, ends, velocities
             scale = longest / length
         for axis in range(3):
             step = scale * displacements[i, axis]
-            ends[i, axis] = positions[i, axis] + step
+            ends[i, axis] = wanted[i, axis] = positions[i, axis] + step
+            origins[i, axis] = positions[i, axis]
             velocities[i, axis] += (step - free[i, axis]) * inverse_step
 
 
 @parallel_kernel
 def take_stops(starts, origins, wanted, ends, inverse_step, density, velocities, fastest):
-    """Take out of velocities what solids did not let happen.
+    """Take out of velocities what solids did not let happen, and go where they let it be.
 
     Args:
-        starts: where particles were [m], (N, 3).
+        starts: where particles were [m], (N, 3); the ends afterwards.
         origins: the same, but for those that had to be rescued from between solids [m], (N, 3).
         wanted: where particles wanted to be [m], (N, 3).
         ends: where the solids let them be [m], (N, 3).
@@ -206,6 +208,7 @@ def take_stops(starts, origins, wanted, ends, inverse_step, density, velocities,
                 if ends[i, axis] != wanted[i, axis] or origins[i, axis] != starts[i, axis]:
                     stop = (ends[i, axis] - wanted[i, axis]) - (origins[i, axis] - starts[i, axis])
                     velocities[i, axis] += stop * inverse_step
+                starts[i, axis] = ends[i, axis]
                 square += velocities[i, axis] * velocities[i, axis]
             if density[i] < SPRAY:
                 square *= np.float32(0.25)

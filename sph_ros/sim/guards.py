@@ -116,7 +116,15 @@ class Guard:
             numbers: JSON-able facts of a snapshot without those of the solids.
             solids: iterable of `Solid`; turned into lists of numbers only when they are needed.
         """
-        self._arrays = {name: rows.copy() for name, rows in fluid.arrays().items()}
+        arrays = fluid.arrays()
+        for name in self._arrays.keys() - arrays.keys():
+            del self._arrays[name]
+        for name, rows in arrays.items():
+            kept = self._arrays.get(name)
+            if kept is None or kept.shape != rows.shape:
+                self._arrays[name] = rows.copy()
+            else:
+                np.copyto(kept, rows)  # the same memory each time: that of new arrays costs more
         self._numbers = numbers
         self._solids = [_shallow(solid) for solid in solids]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sph_ros.core.neighbors import bounding_box
+from sph_ros.core.neighbors import farthest_coordinates
 from sph_ros.core.surface import extract_surface
 from sph_ros.sim.abilities import alike, faults
 from sph_ros.sim.emitters import Emitters
@@ -188,11 +188,7 @@ class Simulation:
 
     def _liquid_reach(self):
         """Distance of the farthest particle from the origin of the world, at least [m]."""
-        if not len(self._fluid):
-            return 0.0
-        lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
-        bounding_box(self._fluid.positions, lower, upper)
-        return float(np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper))))
+        return math.hypot(*farthest_coordinates(self._fluid.positions))
 
     def advance(self, seconds):
         """Advance by whole steps until at least `seconds` [s] more are simulated."""

@@ -4,6 +4,7 @@
 import numpy as np
 
 from sph_ros.core.distances import signed_distances
+from sph_ros.core.neighbors import farthest_coordinates
 from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shapes import pack_shapes
 
@@ -44,6 +45,8 @@ class Sinks:
 
     def advance(self, fluid, now):
         """Remove the particles that are in a sink at a time [s], or far away."""
+        if not self._sinks and max(farthest_coordinates(fluid.positions)) <= self._farthest():
+            return
         taken = np.zeros(len(fluid), bool)
         for index, sink in enumerate(self._sinks):
             if sink.from_time <= now < sink.until and len(fluid):

@@ -181,6 +181,8 @@ class Solid:
             liquid_reach: distance of the farthest particle from the world's origin [m]; what is
                 farther of an endless solid moves nothing.
         """
+        if not self._waypoints:
+            return 0.0
         position, quat = self._wanted(now, now + duration)
         turn = quaternions.between(self.quat_xyzw, quat)
         return float(np.linalg.norm(position - self.position)) + self._lever(liquid_reach) * float(
@@ -203,6 +205,9 @@ class Solid:
         Returns:
             The farthest that a point of it moved [m].
         """
+        if not self._waypoints:
+            self.velocity, self.angular_velocity = np.zeros(3), np.zeros(3)
+            return 0.0
         position, quat = self._wanted(now, now + duration)
         shift = position - self.position
         turn = quaternions.between(self.quat_xyzw, quat)
@@ -344,8 +349,8 @@ class Solids:
             ),
             default=0.0,
         )
-        fallen = float(self.bodies.farthest(duration).max(initial=0.0))
-        return max(min(driven, max_speed * duration), fallen)
+        driven = min(driven, max_speed * duration)
+        return max(driven, self.bodies.farthest(duration).max()) if len(self.bodies) else driven
 
     def advance(self, now, duration, max_speed, liquid_reach):
         """Move all solids on for `duration` [s]; arguments as for one `Solid`."""
@@ -355,11 +360,13 @@ class Solids:
         for index, solid in enumerate(self):
             if solid.control in ("topic", "path"):
                 ways[index] = solid.advance(now, duration, max_speed, liquid_reach)
-        self._driven_way = float(ways.max(initial=0.0))
-        self._write_poses(self.motion.position, self.motion.rotation)
-        ways[self.bodies.solids] = self.bodies.farthest(duration)
-        self.bodies.begin(duration, self.motion, ways)
-        self._take_poses()
+        self._driven_way = self.travel = float(ways.max(initial=0.0))
+        if self._driven_way > 0.0:
+            self._write_poses(self.motion.position, self.motion.rotation)
+        if len(self.bodies):
+            ways[self.bodies.solids] = self.bodies.farthest(duration)
+            self.bodies.begin(duration, self.motion, ways)
+            self._take_poses()
 
     def finish(self):
         """Take free bodies to where the liquid lets them.
@@ -368,6 +375,9 @@ class Solids:
             `Motion` from the poses during the substep to those at its end, and the farthest that a
             point of a solid moves on it [m].
         """
+        if not len(self.bodies):
+            still = self.motion
+            return Motion(still.position, still.rotation, still.position, still.rotation), 0.0
         before = self.motion.position.copy(), self.motion.rotation.copy()
         way = self.bodies.finish()
         self._take_poses()

@@ -174,7 +174,7 @@ class Solver:
         """
         solids = self._solids
         reactions = np.zeros((max(search.chunk_count(len(fluid)), 1), len(solids), 6))
-        if solids.sheets.bounce.any():
+        if len(solids.sheets.solid) and solids.sheets.bounce.any():
             sheets.bounce_off_sheets(
                 fluid.positions,
                 fluid.velocities,
@@ -255,7 +255,7 @@ class Solver:
         search.gather_rows(work.order, work.starts, fluid.positions)
         search.gather_rows(work.order, work.predicted, work.scratch)
         work.predicted, work.scratch = work.scratch, work.predicted
-        fluid.reorder(work.order)
+        fluid.reorder(work.order, work)
         self._weigh(fluid)
 
     def _find_contacts(self, time_step, clearance, motion=None):

@@ -4,7 +4,7 @@
 import numpy as np
 
 from sph_ros.core.contacts import TERMS, Contacts
-from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count
+from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count, gather_values
 from sph_ros.core.pair_sums import Pairs
 from sph_ros.core.vector import LANES
 
@@ -104,9 +104,20 @@ class Fluid:
         result[self.particle] = rows
         return result
 
-    def reorder(self, order):
-        """Let row k be what was row order[k], in all arrays but positions and velocities."""
-        for rows in (self.pressures, self.clearance, self.particle, *self.extras.values()):
+    def reorder(self, order, work):
+        """Let row k be what was row order[k], in all arrays but positions and velocities.
+
+        Args:
+            order: (N,) int32.
+            work: `Workspace`; of its arrays `diagonal`, `residuals` and `cell_of` are used.
+        """
+        spares = work.diagonal, work.residuals, work.cell_of
+        for rows, spare in zip(
+            (self.pressures, self.clearance, self.particle), spares, strict=True
+        ):
+            gather_values(order, rows, spare)
+            rows[:] = spare
+        for rows in self.extras.values():
             rows[:] = rows.take(order, axis=0, mode="clip")  # the fastest of numpy's ways
 
     def add(self, positions, velocities, ids):
