@@ -57,9 +57,8 @@ PACES = {
     SMOOTH_POWER: Pace(courant=0.4, surge=0.5, corrected=0.2, calming=0.005),
 }
 
-#: Share of the particles whose pressures do not count for the length of a step; it is looked for
-#: among at least half of so many particles, or all there are.
-PEAKS, SAMPLE = 0.005, 8192
+#: Share of the particles whose pressures do not count for the length of a step.
+PEAKS = 0.005
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
@@ -293,9 +292,8 @@ class IncompressibleSolver(PressureSolver):
         self._iterate(work.targets, np.float32(0.0), goal, time_step, work.residuals)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         if len(fluid):
-            some = fluid.pressures[:: len(fluid) // SAMPLE + 1]
-            rank = int((1.0 - PEAKS) * (len(some) - 1))
-            self._pressed = float(np.partition(some, rank)[rank])
+            rank = int((1.0 - PEAKS) * (len(fluid) - 1))
+            self._pressed = float(np.partition(fluid.pressures, rank)[rank])
         self._push_bodies(self._solids.bodies.inertias.centre)
 
     def _pull_together(self, time_step):
