@@ -155,9 +155,9 @@ def test_however_the_particles_lie_rubbing_takes_energy_and_a_rigid_rotation_doe
     def rub(velocities, spins, strength, radius):
         core.rub_spins(
             work.pairs,
+            work.columns,
             work.sums,
             velocities,
-            np.float32(0.01 * ratio),
             np.float32(determinant * scale**3),
             np.float32(square * scale**2),
             np.float32(4.0 * strength * 1e-4),

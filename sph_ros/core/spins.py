@@ -22,73 +22,89 @@ of the liquid's rotation on itself, -n_i in p_i, and so may feed energy.)
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.vector import (
+    LANES,
+    gather,
+    gather_column,
+    lanes_from,
+    larger,
+    load,
+    put,
+    smaller,
+    spread,
+    take,
+)
 
 #: Determinant of M, relative to the lattice's, that stands for no neighbours at all [-].
 NOTHING = np.float32(1e-9)
 
 
-@device
-def solved(xx, yy, zz, xy, xz, yz, least, x, y, z):
-    """Solution of a symmetric system of three equations, and its determinant, at least `least`."""
+@inlined
+def solved(matrix, least, x, y, z):
+    """Solutions of symmetric systems of three equations, and determinants, at least `least`."""
+    xx, yy, zz, xy, xz, yz = matrix
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    determinant = max(xx * a + xy * b + xz * c, least)
-    scale = np.float32(1.0) / determinant
+    determinant = larger(xx * a + xy * b + xz * c, spread(least))
     return (
-        scale * (a * x + b * y + c * z),
-        scale * (b * x + d * y + e * z),
-        scale * (c * x + e * y + f * z),
+        (a * x + b * y + c * z) / determinant,
+        (b * x + d * y + e * z) / determinant,
+        (c * x + e * y + f * z) / determinant,
         determinant,
     )
 
 
-@device
-def matrix_of_pairs(pairs, support_radius, i):
-    """M of particle i [-]: xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    xy, xz, yz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    start, end = pairs.start[i], pairs.end[i]
-    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-    gz, us = pairs.gradients[2, start:end], pairs.gradients[3, start:end]
-    for k in range(us.shape[0]):
-        x2, y2, z2 = gx[k] * gx[k], gy[k] * gy[k], gz[k] * gz[k]
-        # The distance over the gradient's length; a particle's own gradient is 0.
-        length = np.sqrt(max(x2 + y2 + z2, np.float32(1e-20)))
-        c = support_radius * (np.float32(1.0) - us[k]) / length
-        xx += c * (y2 + z2)
-        yy += c * (x2 + z2)
-        zz += c * (x2 + y2)
-        xy -= c * gx[k] * gy[k]
-        xz -= c * gx[k] * gz[k]
-        yz -= c * gy[k] * gz[k]
-    return xx, yy, zz, xy, xz, yz
+@inlined
+def matrix_of_pairs(pairs, columns, first):
+    """M of the particles of a slice [-]: xx, yy, zz, xy, xz, yz."""
+    zero = np.float32(0.0)
+    xx, yy, zz = spread(zero), spread(zero), spread(zero)
+    xy, xz, yz = spread(zero), spread(zero), spread(zero)
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    rows = lanes_from(first, pairs.start.shape[0])
+    x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
+    for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        j = load(pairs.neighbors, k)
+        dx, dy, dz = gather(xs, j) - x, gather(ys, j) - y, gather(zs, j) - z
+        gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+        xx += gy * dy + gz * dz
+        yy += gx * dx + gz * dz
+        zz += gx * dx + gy * dy
+        xy -= gx * dy
+        xz -= gx * dz
+        yz -= gy * dz
+    unit = pairs.unit[0]
+    return unit * xx, unit * yy, unit * zz, unit * xy, unit * xz, unit * yz
 
 
-@device
-def turning_of_pairs(pairs, velocities, i):
-    """Sum of g_ij x (v_j - v_i) over the neighbours j of particle i, x, y, z [1/s]."""
-    x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    vx, vy, vz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
-    start, end = pairs.start[i], pairs.end[i]
-    js = pairs.neighbors[start:end]
-    gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-    gz = pairs.gradients[2, start:end]
-    for k in range(js.shape[0]):
-        j = js[k]
-        a, b, c = velocities[j, 0] - vx, velocities[j, 1] - vy, velocities[j, 2] - vz
-        x += gy[k] * c - gz[k] * b
-        y += gz[k] * a - gx[k] * c
-        z += gx[k] * b - gy[k] * a
-    return x, y, z
+@inlined
+def turning_of_pairs(pairs, velocities, first):
+    """Sum of g_ij x (v_j - v_i) over the neighbours j of a slice, x, y, z [1/s]."""
+    zero = np.float32(0.0)
+    x, y, z = spread(zero), spread(zero), spread(zero)
+    rows = lanes_from(first, velocities.shape[0])
+    vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
+    vz = gather_column(velocities, rows, 2)
+    for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        j = load(pairs.neighbors, k)
+        gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+        a = gather_column(velocities, j, 0) - vx
+        b = gather_column(velocities, j, 1) - vy
+        c = gather_column(velocities, j, 2) - vz
+        x += gy * c - gz * b
+        y += gz * a - gx * c
+        z += gx * b - gy * a
+    unit = pairs.unit[0]
+    return unit * x, unit * y, unit * z
 
 
 @parallel_kernel
 def rub_spins(
     pairs,
+    columns,
     sums,
     velocities,
-    support_radius,
     determinant,
     square,
     exchange,
@@ -105,8 +121,8 @@ def rub_spins(
 
     Args:
         pairs, sums: from `sum_densities`.
+        columns: coordinates [m], as there.
         velocities: [m/s], (N, 3).
-        support_radius: h [m], float32.
         determinant: of M in the lattice [-], float32.
         square: sum of squared gradients in the lattice [1/m^2], float32.
         exchange: c times the step [m^2], float32.
@@ -116,27 +132,30 @@ def rub_spins(
         pushes: p_i times the step [m^2/s], (N, 3); written.
     """
     one = np.float32(1.0)
-    gradients, squares = sums.gradient, sums.gradient_square
-    for i in prange(spins.shape[0]):
-        xx, yy, zz, xy, xz, yz = matrix_of_pairs(pairs, support_radius, i)
-        least = NOTHING * determinant
-        x, y, z = turning_of_pairs(pairs, velocities, i)
-        x, y, z, found = solved(xx, yy, zz, xy, xz, yz, least, x, y, z)
-        known = min(found / determinant, one)
-        gx, gy, gz = gradients[i, 0], gradients[i, 1], gradients[i, 2]
-        uneven = (squares[i] + gx * gx + gy * gy + gz * gz) / square
-        known *= known / max(uneven * uneven, one)
+    gradients, squares, count = sums.gradient, sums.gradient_square, spins.shape[0]
+    least = NOTHING * determinant
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        matrix = matrix_of_pairs(pairs, columns, first)
+        x, y, z = turning_of_pairs(pairs, velocities, first)
+        x, y, z, found = solved(matrix, least, x, y, z)
+        known = smaller(found / determinant, spread(one))
+        gx, gy = gather_column(gradients, rows, 0), gather_column(gradients, rows, 1)
+        gz = gather_column(gradients, rows, 2)
+        uneven = (take(squares, first) + gx * gx + gy * gy + gz * gz) / square
+        known *= known / larger(uneven * uneven, spread(one))
         if new:
-            spins[i, 0], spins[i, 1], spins[i, 2] = known * x, known * y, known * z
+            put((known * x, known * y, known * z), spins, first)
         strength = exchange * known
         share = strength / (square_radius + strength)
-        x, y, z = spins[i, 0] - x, spins[i, 1] - y, spins[i, 2] - z
-        spins[i, 0] -= share * x
-        spins[i, 1] -= share * y
-        spins[i, 2] -= share * z
+        wx, wy = gather_column(spins, rows, 0), gather_column(spins, rows, 1)
+        wz = gather_column(spins, rows, 2)
+        x, y, z = wx - x, wy - y, wz - z
+        put((wx - share * x, wy - share * y, wz - share * z), spins, first)
         strength *= one - share
-        x, y, z, _ = solved(xx, yy, zz, xy, xz, yz, least, x, y, z)
-        pushes[i, 0], pushes[i, 1], pushes[i, 2] = strength * x, strength * y, strength * z
+        x, y, z, _ = solved(matrix, least, x, y, z)
+        put((strength * x, strength * y, strength * z), pushes, first)
 
 
 @parallel_kernel
@@ -148,19 +167,24 @@ def push_by_spins(pairs, pushes, velocities):
         pushes: from `rub_spins` [m^2/s], (N, 3).
         velocities: [m/s], (N, 3); changed.
     """
-    for i in prange(velocities.shape[0]):
-        x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        px, py, pz = pushes[i, 0], pushes[i, 1], pushes[i, 2]
-        start, end = pairs.start[i], pairs.end[i]
-        js = pairs.neighbors[start:end]
-        gx, gy = pairs.gradients[0, start:end], pairs.gradients[1, start:end]
-        gz = pairs.gradients[2, start:end]
-        for k in range(js.shape[0]):
-            j = js[k]
-            a, b, c = px + pushes[j, 0], py + pushes[j, 1], pz + pushes[j, 2]
-            x += b * gz[k] - c * gy[k]
-            y += c * gx[k] - a * gz[k]
-            z += a * gy[k] - b * gx[k]
-        velocities[i, 0] -= x
-        velocities[i, 1] -= y
-        velocities[i, 2] -= z
+    zero, count = np.float32(0.0), velocities.shape[0]
+    for s in prange(pairs.stop.shape[0]):
+        first = s * LANES
+        rows = lanes_from(first, count)
+        x, y, z = spread(zero), spread(zero), spread(zero)
+        px, py = gather_column(pushes, rows, 0), gather_column(pushes, rows, 1)
+        pz = gather_column(pushes, rows, 2)
+        for k in range(pairs.start[first], pairs.stop[s], LANES):
+            j = load(pairs.neighbors, k)
+            gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+            a = px + gather_column(pushes, j, 0)
+            b = py + gather_column(pushes, j, 1)
+            c = pz + gather_column(pushes, j, 2)
+            x += b * gz - c * gy
+            y += c * gx - a * gz
+            z += a * gy - b * gx
+        unit = pairs.unit[0]
+        x = gather_column(velocities, rows, 0) - unit * x
+        y = gather_column(velocities, rows, 1) - unit * y
+        z = gather_column(velocities, rows, 2) - unit * z
+        put((x, y, z), velocities, first)
