@@ -103,5 +103,7 @@ def _number(name, value, limits):
         raise ValueError(f"{name}: expected a number greater than {above:g}{unit}, got {number:g}")
     if not low <= number <= high:
         wanted = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
+        if not math.isfinite(low):
+            wanted = f"at most {high:g}" if above is None else f"above {above:g} to {high:g}"
         raise ValueError(f"{name}: expected {wanted}{unit}, got {number:g}")
     return number
