@@ -50,8 +50,7 @@ def searched(points, power=2):
     assert search.bounding_box(points, lower, upper) == -1
     grid = make_grid(lower, upper, float(H), len(points))
     search.sort_by_cell(points, grid, work.cell_of, work.order)
-    search.gather_rows(work.order, points, work.predicted)
-    search.transpose(work.predicted, work.columns)
+    search.gather_positions(work.order, points, points, work.starts, work.predicted, work.columns)
     while search.find_neighbors(work.columns, grid, H, work.chunks, work.pairs):
         work.enlarge_pairs()
     search.sum_densities(

@@ -178,19 +178,28 @@ def gather_rows(order, source, target):
 
 
 @parallel_kernel
-def gather_values(order, source, target):
-    """target[k] = source[order[k]] for (N,) arrays."""
+def gather_values(order, a, b, c, new_a, new_b, new_c):
+    """new[k] = old[order[k]] for three (N,) arrays."""
     for k in prange(order.shape[0]):
-        target[k] = source[order[k]]
+        i = order[k]
+        new_a[k], new_b[k], new_c[k] = a[i], b[i], c[i]
 
 
 @parallel_kernel
-def transpose(positions, columns):
-    """Write (N, 3) `positions` into the rows of (3, N + padding) `columns`."""
-    for i in prange(positions.shape[0]):
-        columns[0, i] = positions[i, 0]
-        columns[1, i] = positions[i, 1]
-        columns[2, i] = positions[i, 2]
+def gather_positions(order, starts, ends, new_starts, new_ends, columns):
+    """new[k] = old[order[k]] for two (N, 3) arrays; the second one's columns once more.
+
+    Args:
+        order: (N,).
+        starts, ends: [m], (N, 3).
+        new_starts, new_ends: (N, 3); written.
+        columns: (3, N + padding); written.
+    """
+    for k in prange(order.shape[0]):
+        i = order[k]
+        for axis in range(3):
+            new_starts[k, axis] = starts[i, axis]
+            new_ends[k, axis] = columns[axis, k] = ends[i, axis]
 
 
 @bare

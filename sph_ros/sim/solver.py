@@ -247,13 +247,19 @@ class Solver:
     def _sort(self, fluid):
         """Order all rows by cell of the predicted positions; velocities stay as they are.
 
-        Written are positions (from `starts`) and predicted positions of the workspace.
+        Written are positions (from `starts`), predicted positions of the workspace and `columns`.
         """
         work = self._work
         self._grid_now = grid = self._grid()
         search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
-        search.gather_rows(work.order, work.starts, fluid.positions)
-        search.gather_rows(work.order, work.predicted, work.scratch)
+        search.gather_positions(
+            work.order,
+            work.starts,
+            work.predicted,
+            fluid.positions,
+            work.scratch,
+            work.columns,
+        )
         work.predicted, work.scratch = work.scratch, work.predicted
         fluid.reorder(work.order, work)
         self._weigh(fluid)
@@ -277,7 +283,6 @@ class Solver:
 
     def _find_neighbors(self):
         work = self._work
-        search.transpose(work.predicted, work.columns)
         while search.find_neighbors(work.columns, self._grid_now, self._h, work.chunks, work.pairs):
             work.enlarge_pairs()
         if len(self._solids.sheets.solid):

@@ -111,12 +111,11 @@ class Fluid:
             order: (N,) int32.
             work: `Workspace`; of its arrays `diagonal`, `residuals` and `cell_of` are used.
         """
-        spares = work.diagonal, work.residuals, work.cell_of
-        for rows, spare in zip(
-            (self.pressures, self.clearance, self.particle), spares, strict=True
-        ):
-            gather_values(order, rows, spare)
-            rows[:] = spare
+        sorted_rows = work.diagonal, work.residuals, work.cell_of
+        rows = self.pressures, self.clearance, self.particle
+        gather_values(order, *rows, *sorted_rows)
+        for old, new in zip(rows, sorted_rows, strict=True):
+            old[:] = new
         for rows in self.extras.values():
             rows[:] = rows.take(order, axis=0, mode="clip")  # the fastest of numpy's ways
 
