@@ -238,7 +238,8 @@ def test_first_position_that_is_no_number_is_named():
 def test_processors_without_vector_instructions_find_the_same(tmp_path):
     """The other branches of the vector code, in a fresh interpreter that is told to take them."""
     script = (
-        "import sph_ros.core.vector as v; v.HAS_COMPRESSING_STORE = v.HAS_GATHER = False\n"
+        "from sph_ros.core import near_points, vector, vector_memory\n"
+        "for m in near_points, vector, vector_memory: m.HAS_AVX512 = False\n"
         "import numpy as np, test_neighbors as t\n"
         "w, _ = t.iterated(t.cloud('uniform'), 3)\n"
         "lists = [t.neighbors_of(w.pairs, i) for i in range(400)]\n"

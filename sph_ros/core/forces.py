@@ -25,20 +25,8 @@ from sph_ros.core.contacts import GRADIENT, NEAR_GRADIENT, SURFACE_VELOCITY, add
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of
-from sph_ros.core.vector import (
-    LANES,
-    gather,
-    gather_column,
-    inverse_root,
-    lanes_from,
-    larger,
-    load,
-    put,
-    smaller,
-    spread,
-    store,
-    take,
-)
+from sph_ros.core.vector import LANES, inverse_root, larger, smaller, spread
+from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, store, take
 
 
 class State(NamedTuple):
@@ -108,7 +96,7 @@ def sum_densities(columns, velocities, support_radius, factors, pairs, state):
         velocities: [m/s], (N, 3).
         support_radius: h [m], float32.
         factors: `Factors`.
-        pairs: `gradients` is written: spiky gradient at i [1/m] and u.
+        pairs: all but the lists is written: spiky gradient at i and u.
         state: `density` and `rate` are written, without the walls.
     """
     zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)

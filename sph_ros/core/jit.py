@@ -4,7 +4,8 @@
 One floating-point policy for all: sums may be re-associated and multiplications fused, so that
 loops vectorise, but NaN and infinity keep their meaning (a NaN must stay visible) and no
 approximate reciprocal is taken, because a vector body and its scalar remainder would then round
-differently and the result would depend on how the loop was split among threads.
+differently and the result would depend on how the loop was split among threads. (The vectors of
+`core.vector` have no remainder, so its `inverse_root` may start from the processor's estimate.)
 """
 
 import hashlib

@@ -13,22 +13,10 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.jit import bare, device, kernel, parallel_kernel
+from sph_ros.core.near_points import append_within
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
-from sph_ros.core.vector import (
-    LANES,
-    append_within,
-    gather,
-    gather_column,
-    inverse_root,
-    lanes_from,
-    larger,
-    load,
-    put,
-    spread,
-    store,
-    take,
-    where_whole,
-)
+from sph_ros.core.vector import LANES, inverse_root, larger, spread, where_whole
+from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, store, take
 
 #: Particles handled by one piece of parallel work, whole slices; fixed, so that no sum depends on
 #: the threads.
@@ -307,7 +295,7 @@ def sum_densities(
         density_scale, near_scale: 1 / lattice sums of the two weights [-], float32.
         wall_density: density and near-density that walls add [-], (N, 2).
         chunks: `chunk_count(N)`.
-        pairs: `gradients` is written.
+        pairs: all but the lists is written.
         sums: all written.
     """
     inverse_h = np.float32(1.0) / support_radius

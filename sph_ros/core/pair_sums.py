@@ -16,17 +16,19 @@ from sph_ros.core.jit import inlined
 from sph_ros.core.vector import (
     LANES,
     as_floats,
-    gather,
-    gather_column,
-    gather_words,
     inverse_root,
-    lanes_from,
     larger,
-    load,
     root,
     rounded,
     smaller,
     spread,
+)
+from sph_ros.core.vector_memory import (
+    gather,
+    gather_column,
+    gather_words,
+    lanes_from,
+    load,
     store,
     take,
 )

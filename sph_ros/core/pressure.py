@@ -13,18 +13,8 @@ from numba import prange
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import divergence_of_pairs, pack, push_by_pairs
-from sph_ros.core.vector import (
-    LANES,
-    gather_column,
-    lanes_from,
-    larger,
-    magnitude,
-    put,
-    spread,
-    take,
-    total,
-    where,
-)
+from sph_ros.core.vector import LANES, larger, magnitude, spread, total, where
+from sph_ros.core.vector_memory import gather_column, lanes_from, put, take
 
 #: Fields of the state of an iteration, an array of float64; see `fresh_state`.
 ITERATION, SHARE, INERTIA, BEFORE, BEST, ENOUGH, ERROR, DONE, FIELDS = range(9)

@@ -26,17 +26,8 @@ from sph_ros.core.contacts import (
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import weights_after
-from sph_ros.core.vector import (
-    LANES,
-    gather_column,
-    lanes_from,
-    larger,
-    put,
-    smaller,
-    spread,
-    take,
-    where,
-)
+from sph_ros.core.vector import LANES, larger, smaller, spread, where
+from sph_ros.core.vector_memory import gather_column, lanes_from, put, take
 
 #: Excess of density that may be taken back over several steps [-].
 MILD = np.float32(0.01)

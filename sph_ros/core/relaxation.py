@@ -22,7 +22,8 @@ from numba import prange
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import STEPS, impulse_of_pairs
-from sph_ros.core.vector import LANES, gather, gather_column, lanes_from, load, put, spread, take
+from sph_ros.core.vector import LANES, spread
+from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, take
 
 
 class Tension(NamedTuple):

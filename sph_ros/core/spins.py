@@ -23,18 +23,8 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.jit import inlined, parallel_kernel
-from sph_ros.core.vector import (
-    LANES,
-    gather,
-    gather_column,
-    lanes_from,
-    larger,
-    load,
-    put,
-    smaller,
-    spread,
-    take,
-)
+from sph_ros.core.vector import LANES, larger, smaller, spread
+from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, take
 
 #: Determinant of M, relative to the lattice's, that stands for no neighbours at all [-].
 NOTHING = np.float32(1e-9)
