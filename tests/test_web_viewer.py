@@ -324,8 +324,9 @@ def test_dragging_the_gizmo_moves_the_ball_in_the_simulation(stage, page):
 
     def pulled():
         """Whether the ball went along the arrow; a busy browser may miss a way, or the arrow."""
-        if poses and hand()[2] > begin[-1][2] + 0.005:
-            return np.abs((hand() - begin[-1])[:2]).max() < 1e-6
+        moved = hand() - begin[-1] if poses else np.zeros(3)
+        if moved[2] > 0.005 and np.abs(moved[:2]).max() < 1e-6:
+            return True
         if time.monotonic() > tried[-1] + 3.0:
             begin.append(hand() if poses else start)
             if drag_ball(page):
@@ -343,7 +344,9 @@ def drag_ball(page):
     shaft = blue(image)[y - 80 : y - 10, x - 12 : x + 12]  # as far as it is not on the ball
     if not shaft.any():
         return False
-    rise, aside = (int(np.median(index)) for index in np.nonzero(shaft))
+    rows, columns = np.nonzero(shaft)
+    tip = rows <= rows.min() + 10  # farther down are the handles of planes and turns beside it
+    rise, aside = int(np.median(rows[tip])), int(np.median(columns[tip]))
     x, y = x - 12 + aside, y - 80 + rise
     page.drag([(x, y - 6 * step) for step in range(7)])
     return True
