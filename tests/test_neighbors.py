@@ -15,9 +15,10 @@ from sph_ros.core import pressure
 from sph_ros.core import projection as project
 from sph_ros.core import relaxation as relax
 from sph_ros.core.pair_sums import STEPS
+from sph_ros.core.rows import bounding_box
 from sph_ros.core.vector import LANES
 from sph_ros.core.weights import lattice_sum
-from sph_ros.sim.state import Workspace, make_grid
+from sph_ros.sim.state import Fluid, Workspace, make_grid
 
 H = np.float32(0.02)
 FULL = {power: lattice_sum(power, 0.02, 0.01, 3) for power in (2, 3)}
@@ -47,10 +48,11 @@ def searched(points, power=2):
     """Sorted positions, the work arrays with lists and sums, and the sort order."""
     work = Workspace(len(points), 0, pairs_per_particle=8)
     lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
-    assert search.bounding_box(points, lower, upper) == -1
+    assert bounding_box(points, lower, upper) == -1
     grid = make_grid(lower, upper, float(H), len(points))
     search.sort_by_cell(points, grid, work.cell_of, work.order)
-    search.gather_positions(work.order, points, points, work.starts, work.predicted, work.columns)
+    Fluid(points, points).reorder(points, points, work)
+    work.predicted[:] = work.scratch
     while search.find_neighbors(work.columns, grid, H, work.chunks, work.pairs):
         work.enlarge_pairs()
     search.sum_densities(
@@ -232,7 +234,7 @@ def test_first_position_that_is_no_number_is_named():
     points = cloud("uniform")
     points[123, 1] = np.nan
     box = np.empty(3, np.float32), np.empty(3, np.float32)
-    assert search.bounding_box(points, *box) == 123
+    assert bounding_box(points, *box) == 123
 
 
 def test_processors_without_vector_instructions_find_the_same(tmp_path):

@@ -31,7 +31,7 @@ class Contacts(NamedTuple):
     """Contacts of particle i are rows start[i]:end[i].
 
     Attributes:
-        start, end: (N,) int64.
+        start, end: (N,) int32.
         solid: (K,) int32.
         terms: the columns named above, world frame; gradients already include the other solids'
             share and are [1/m], the surface's velocity [m/s], its distance [m], (K, TERMS) float32.

@@ -26,8 +26,8 @@ from sph_ros.core.contact_data import (
     write_surface_velocity,
 )
 from sph_ros.core.distances import distance_and_normal, signed_distance
-from sph_ros.core.jit import device, inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.jit import called, inlined, parallel_kernel
+from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.sheet_contacts import add_sheet_contacts
 from sph_ros.core.walls import wall_terms
 
@@ -42,7 +42,7 @@ def add_contact(shapes, motion, s, x, y, z, inverse_step, solid, terms, row):
         Whether it was, and a distance to the solid that is at most the true one [m].
     """
     lx, ly, lz = to_solid(motion.rotation, motion.position, s, x, y, z)
-    found = wall_terms(shapes, s, lx, ly, lz)
+    found = wall_terms(shapes, s, lx, ly, lz, shapes.reach[s])
     fraction = found[4]
     if fraction <= np.float32(0.0):
         return False, found[0]
@@ -84,17 +84,20 @@ def combine_contacts(contacts, packing, i, begin, end):
             contacts.gradients[i, 3 + axis] += terms[k, NEAR_GRADIENT + axis]
 
 
-@device
+@called
 def find_contacts_of_chunk(
     chunk, positions, clearance, shapes, sheets, motion, inverse_step, packing, slots, contacts
 ):
     """`find_contacts` for one chunk of particles; a function of its own compiles faster."""
     solids = motion.position.shape[0]
     cursor = chunk * CHUNK * slots
+    reach = shapes.support_radius if sheets.solid.shape[0] > 0 else np.float32(0.0)
+    for s in range(solids):
+        reach = max(reach, shapes.reach[s])
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         contacts.start[i] = cursor
-        if clearance[i] < shapes.support_radius:
+        if clearance[i] < reach:
             nearest = np.float32(np.inf)
             for s in range(solids):
                 near, distance = add_contact(
@@ -143,9 +146,9 @@ def find_contacts(
         slots: most contacts of a particle, S and two for each sheet.
         contacts: all written; needs room for chunks * CHUNK * slots contacts.
     """
-    for chunk in prange(chunks):
+    for turn in prange(turns(chunks)):
         find_contacts_of_chunk(
-            np.int64(chunk),
+            chunk_of_turn(turn, chunks),
             positions,
             clearance,
             shapes,
@@ -170,8 +173,9 @@ def pressure_reactions(positions, contacts, motion, sums, pressures, tension, sc
         scale: particle mass / substep^2 [kg/s^2].
         reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.
     """
-    count = positions.shape[0]
-    for chunk in prange(reactions.shape[0]):
+    count, chunks = positions.shape[0], reactions.shape[0]
+    for turn in prange(turns(chunks)):
+        chunk = chunk_of_turn(turn, chunks)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             if contacts.start[i] == contacts.end[i]:
                 continue
@@ -182,7 +186,7 @@ def pressure_reactions(positions, contacts, motion, sums, pressures, tension, sc
                 t = contacts.terms[k]
                 add_reaction(
                     reactions,
-                    np.int64(chunk),
+                    chunk,
                     contacts.solid[k],
                     motion,
                     positions[i, 0],
@@ -209,8 +213,9 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
         velocities: [m/s], (N, 3); changed.
         reactions: as in `pressure_reactions`; added to.
     """
-    count = positions.shape[0]
-    for chunk in prange(reactions.shape[0]):
+    count, chunks = positions.shape[0], reactions.shape[0]
+    for turn in prange(turns(chunks)):
+        chunk = chunk_of_turn(turn, chunks)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             for k in range(contacts.start[i], contacts.end[i]):
                 t = contacts.terms[k]
@@ -229,7 +234,7 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                 velocities[i, 2] -= share * sz
                 add_reaction(
                     reactions,
-                    np.int64(chunk),
+                    chunk,
                     contacts.solid[k],
                     motion,
                     positions[i, 0],
@@ -241,7 +246,7 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
                 )
 
 
-@device
+@called
 def distance_called(shapes, s, x, y, z):
     """`signed_distance` as a function of its own.
 
@@ -251,13 +256,13 @@ def distance_called(shapes, s, x, y, z):
     return signed_distance(shapes, s, x, y, z)
 
 
-@device
+@called
 def normal_called(shapes, s, x, y, z):
     """`distance_and_normal` as a function of its own."""
     return distance_and_normal(shapes, s, x, y, z)
 
 
-@device
+@called
 def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest):
     """Share of the way from a to b, in the frame of solid s, at which a point meets it; 1: never.
 
@@ -279,13 +284,16 @@ def first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, short
     return np.float32(1.0)
 
 
-@device
+@called
 def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
     """End of a motion from a to b that slides along solid s where it meets it, solid's frame."""
     dx, dy, dz = bx - ax, by - ay, bz - az
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     distance = distance_called(shapes, s, ax, ay, az)
     if distance > length + margin:
+        return bx, by, bz
+    # A way to a solid and back to the end would be too long.
+    if distance + distance_called(shapes, s, bx, by, bz) > length + np.float32(2.0) * margin:
         return bx, by, bz
     share = first_hit(shapes, s, distance, ax, ay, az, bx, by, bz, length, margin, shortest)
     if share < np.float32(1.0):
@@ -303,7 +311,7 @@ def slide(shapes, s, ax, ay, az, bx, by, bz, margin, shortest):
     return bx, by, bz
 
 
-@device
+@called
 def is_free(shapes, motion, x, y, z, margin):
     """Whether a world point keeps the margin from every solid."""
     for s in range(motion.position.shape[0]):
@@ -313,7 +321,7 @@ def is_free(shapes, motion, x, y, z, margin):
     return True
 
 
-@device
+@called
 def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
     """A free point near (x, y, z), found on growing spheres (circles in 2D); whether there is one.
 
@@ -338,7 +346,7 @@ def nearest_free_point(shapes, motion, x, y, z, margin, spacing, planar):
     return False, x, y, z
 
 
-@device
+@called
 def slide_past_solids(
     i, chunk, starts, ends, shapes, motion, margin, shortest, planar, scale, reactions
 ):
@@ -368,7 +376,7 @@ def slide_past_solids(
     return moved
 
 
-@device
+@called
 def keep_chunk_outside(
     chunk,
     starts,
@@ -461,9 +469,13 @@ def keep_outside(
         reactions: as in `pressure_reactions`; added to.
         squeezed: particles per chunk that had no way out but a rescue, (chunks,) int64; added to.
     """
-    for chunk in prange(reactions.shape[0]):
+    chunks = reactions.shape[0]
+    for turn in prange(turns(chunks)):
+        chunk = chunk_of_turn(turn, chunks)
+        if chunk >= chunks:
+            continue
         squeezed[chunk] += keep_chunk_outside(
-            np.int64(chunk),
+            chunk,
             starts,
             ends,
             origins,

@@ -41,6 +41,7 @@ class PackedShapes(NamedTuple):
         full_cover: largest share of the density and near-density a wall can have, (2,).
         solid_start: nodes of solid i are solid_start[i]:solid_start[i + 1], (S + 1,).
         bounds: ball around the material, centre and radius [m]; radius 1e30 if endless, (S, 4).
+        reach: from this distance on a solid adds no density, at most the support radius [m], (S,).
         node_op: SPHERE ... INTERSECTION, (N,).
         node_sign: +1, or -1 for an inverted leaf, (N,).
         node_transform: rows of [M | b], leaf point = M solid point + b, (N, 3, 4).
@@ -63,6 +64,7 @@ class PackedShapes(NamedTuple):
     full_cover: np.ndarray
     solid_start: np.ndarray
     bounds: np.ndarray
+    reach: np.ndarray
     node_op: np.ndarray
     node_sign: np.ndarray
     node_transform: np.ndarray

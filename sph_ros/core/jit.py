@@ -69,22 +69,23 @@ def _compiler(**options):
 #: Folder of the compiled kernels of these sources in this place.
 KERNELS = _cache_folder()
 
-#: A small scalar function, meant to be inlined into the kernels that call it.
+#: A small function, meant to be inlined into the kernels that call it; may make and return arrays.
 device = _compiler()
 
-#: The same, always part of its caller's code: handing tuples of many arrays to a function that is
-#: really called counts references, which takes longer than the distance to a solid.
-inlined = _compiler(forceinline=True)
+#: A function that reads and writes arrays, or tuples of many of them, but neither makes nor returns
+#: any, and is always part of its caller's code. References are not counted in it, which else takes
+#: longer than the distance to a solid, and lets threads wait for each other. A function that
+#: returned an array would corrupt memory.
+inlined = _compiler(forceinline=True, _nrt=False)
 
-#: The same for functions that read and write arrays, or tuples of them, but neither make nor return
-#: any: no references are counted at all. A function that returned an array would corrupt memory.
-bare = _compiler(forceinline=True, _nrt=False)
+#: The same as a function of its own: for what is long, or called from many places.
+called = _compiler(_nrt=False)
 
 #: A loop over arrays on one thread; the GIL is released.
 kernel = _compiler(nogil=True)
 
-#: The same without counted references, see `bare`: a third to a half of the time where a loop calls
-#: functions with many arrays.
+#: The same without counted references, see `inlined`: a third to a half of the time where a loop
+#: calls functions with many arrays.
 bare_kernel = _compiler(nogil=True, _nrt=False)
 
 #: A loop over arrays spread over threads. Iteration i of `prange` may write row i only. Give arrays

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import bare, device, kernel, parallel_kernel
+from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
 from sph_ros.core.near_points import append_within
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
 from sph_ros.core.vector import LANES, inverse_root, larger, spread, where_whole
@@ -22,8 +22,8 @@ from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, 
 #: the threads.
 CHUNK = 256
 
-#: Coordinates of sixteen particles.
-BLOCK = 48
+#: Stride of the chunks where solids make some of them dear.
+MIXED = 8
 
 
 class Grid(NamedTuple):
@@ -62,6 +62,23 @@ def chunk_count(particle_count):
     return -(-particle_count // CHUNK)
 
 
+@inlined
+def turns(chunks):
+    """How many numbers `chunk_of_turn` has to be asked for."""
+    return MIXED * ((chunks + MIXED - 1) // MIXED)
+
+
+@inlined
+def chunk_of_turn(turn, chunks):
+    """Which chunk comes at a turn; `chunks` and more: none.
+
+    Chunks follow each other upwards, and threads take theirs in one piece. So that not one of them
+    gets all that lies on the floor, they come in strides.
+    """
+    rows = (chunks + MIXED - 1) // MIXED
+    return np.int64((turn % rows) * MIXED + turn // rows)
+
+
 @device
 def cell_coordinate(value, lower, inverse_cell, count):
     """Cell index along one axis; what lies outside the grid belongs to the outermost cell.
@@ -70,54 +87,6 @@ def cell_coordinate(value, lower, inverse_cell, count):
     """
     cell = int(np.floor((value - lower) * inverse_cell))
     return min(max(cell, 0), count - 1)
-
-
-@kernel
-def bounding_box(positions, lower, upper):
-    """Smallest box around `positions` (N, 3) [m]; `lower`, `upper` (3,) are written.
-
-    Returns:
-        The first row that is not finite, or -1.
-    """
-    values = positions.reshape(positions.size)
-    # Blocks of sixteen rows, so that the compiler makes vectors of it; 0 times a value is 0 unless
-    # it is not finite.
-    least, most = np.full(BLOCK, np.float32(np.inf)), np.full(BLOCK, np.float32(-np.inf))
-    zeros = np.zeros(BLOCK, np.float32)
-    whole = values.size // BLOCK * BLOCK
-    for first in range(0, whole, BLOCK):
-        block = values[first : first + BLOCK]
-        for k in range(BLOCK):
-            value = block[k]
-            least[k] = value if value < least[k] else least[k]
-            most[k] = value if value > most[k] else most[k]
-            zeros[k] += np.float32(0.0) * value
-    for k in range(whole, values.size):
-        value, place = values[k], k - whole
-        least[place] = min(least[place], value)
-        most[place] = max(most[place], value)
-        zeros[place] += np.float32(0.0) * value
-    lower[:], upper[:] = np.inf, -np.inf
-    total = np.float32(0.0)
-    for k in range(BLOCK):
-        lower[k % 3] = min(lower[k % 3], least[k])
-        upper[k % 3] = max(upper[k % 3], most[k])
-        total += zeros[k]
-    if total == np.float32(0.0):
-        return -1
-    for i in range(positions.shape[0]):
-        if not np.isfinite(positions[i]).all():
-            return i
-    return -1
-
-
-def farthest_coordinates(positions):
-    """Largest absolute x, y and z of `positions` (N, 3) [m]; 0 where there are none."""
-    if not len(positions):
-        return 0.0, 0.0, 0.0
-    lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
-    bounding_box(positions, lower, upper)
-    return tuple(np.maximum(np.abs(lower), np.abs(upper)).tolist())
 
 
 @kernel
@@ -155,42 +124,7 @@ def sort_by_cell(positions, grid, cell_of, order):
         order[cell_start[cell]] = i
 
 
-@parallel_kernel
-def gather_rows(order, source, target):
-    """target[k] = source[order[k]] for rows of (N, 3) arrays."""
-    for k in prange(order.shape[0]):
-        i = order[k]
-        target[k, 0] = source[i, 0]
-        target[k, 1] = source[i, 1]
-        target[k, 2] = source[i, 2]
-
-
-@parallel_kernel
-def gather_values(order, a, b, c, new_a, new_b, new_c):
-    """new[k] = old[order[k]] for three (N,) arrays."""
-    for k in prange(order.shape[0]):
-        i = order[k]
-        new_a[k], new_b[k], new_c[k] = a[i], b[i], c[i]
-
-
-@parallel_kernel
-def gather_positions(order, starts, ends, new_starts, new_ends, columns):
-    """new[k] = old[order[k]] for two (N, 3) arrays; the second one's columns once more.
-
-    Args:
-        order: (N,).
-        starts, ends: [m], (N, 3).
-        new_starts, new_ends: (N, 3); written.
-        columns: (3, N + padding); written.
-    """
-    for k in prange(order.shape[0]):
-        i = order[k]
-        for axis in range(3):
-            new_starts[k, axis] = starts[i, axis]
-            new_ends[k, axis] = columns[axis, k] = ends[i, axis]
-
-
-@bare
+@inlined
 def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     """Append the neighbours of particle i; the new cursor, or -1 where there is no room."""
     xs, ys, zs = columns[0], columns[1], columns[2]
@@ -213,7 +147,7 @@ def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     return cursor
 
 
-@bare
+@inlined
 def store_slice(first, staged, pairs, cursor, width):
     """Bring the lists of a slice from one after the other to side by side.
 

@@ -48,6 +48,19 @@ def fresh_state(share):
 
 
 @parallel_kernel
+def scale_guess(pressures, unit, scaled, guesses, first):
+    """What iterations begin with: a first guess of the pressures, three times.
+
+    Args:
+        pressures: [Pa], (N,).
+        unit: scaled pressure [m^2] per pressure, float32.
+        scaled, guesses, first: see `iterate_pressures`, (N,); written.
+    """
+    for i in prange(pressures.shape[0]):
+        scaled[i] = guesses[i] = first[i] = pressures[i] * unit
+
+
+@parallel_kernel
 def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
     """How much a particle's own scaled pressure lowers its own density [1/m^2].
 

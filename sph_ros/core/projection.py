@@ -23,8 +23,8 @@ from sph_ros.core.contacts import (
     to_solid,
     to_world,
 )
-from sph_ros.core.jit import parallel_kernel
-from sph_ros.core.neighbors import CHUNK
+from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.pair_sums import weights_after
 from sph_ros.core.vector import LANES, larger, smaller, spread, where
 from sph_ros.core.vector_memory import gather_column, lanes_from, put, take
@@ -36,6 +36,18 @@ MILD = np.float32(0.01)
 SPRAY = 0.6
 
 
+@inlined
+def is_still(motion, s):
+    """Whether solid s ends a substep where it began."""
+    for axis in range(3):
+        if motion.position[s, axis] != motion.old_position[s, axis]:
+            return False
+        for other in range(3):
+            if motion.rotation[s, axis, other] != motion.old_rotation[s, axis, other]:
+                return False
+    return True
+
+
 @parallel_kernel
 def contact_velocities(positions, motion, inverse_step, contacts):
     """Velocity of the solids at the contacts: from their old pose to the new one in a step.
@@ -44,36 +56,51 @@ def contact_velocities(positions, motion, inverse_step, contacts):
         positions: [m], (N, 3), where the contacts were found with the solids at their old pose.
         motion: poses before and after the step.
         inverse_step: 1 / dt [1/s], float32.
-        contacts: the surface velocities among `terms` are written.
+        contacts: found as if in endless time, so that nothing moves; of solids that do, the surface
+            velocities among `terms` are written.
     """
     # A name of its own: numba loses writes to arrays of a tuple inside prange.
     terms, solids = contacts.terms, contacts.solid
-    for i in prange(positions.shape[0]):
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        for k in range(contacts.start[i], contacts.end[i]):
-            s = solids[k]
-            lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
-            nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
-            terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
-            terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
-            terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+    still = 0
+    for s in range(motion.position.shape[0]):
+        still += is_still(motion, s)
+    if still == motion.position.shape[0]:
+        return
+    count, chunks = positions.shape[0], (positions.shape[0] + CHUNK - 1) // CHUNK
+    for turn in prange(turns(chunks)):
+        chunk = chunk_of_turn(turn, chunks)
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            for k in range(contacts.start[i], contacts.end[i]):
+                s = solids[k]
+                if is_still(motion, s):
+                    continue
+                x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+                lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
+                nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
+                terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
+                terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
+                terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
 
 
 @parallel_kernel
-def push(velocities, gravity, time_step, displacements):
+def push(velocities, gravity, time_step, pulled, displacements):
     """Velocities under all forces but pressure, and where they lead.
 
     Args:
         velocities: [m/s], (N, 3); changed.
         gravity: [m/s^2], (3,) float32.
         time_step: [s], float32.
+        pulled: whether there are other forces.
         displacements: those by other forces, from rest in one step [m], (N, 3); replaced by the
-            way that the changed velocities make.
+            way that the changed velocities make. What is in it is of no use if there are none.
     """
     inverse_step = np.float32(1.0) / time_step
     for i in prange(velocities.shape[0]):
         for axis in range(3):
-            velocities[i, axis] += time_step * gravity[axis] + displacements[i, axis] * inverse_step
+            velocity = velocities[i, axis] + time_step * gravity[axis]
+            if pulled:
+                velocity += displacements[i, axis] * inverse_step
+            velocities[i, axis] = velocity
             displacements[i, axis] = time_step * velocities[i, axis]
 
 

@@ -25,7 +25,7 @@ from sph_ros.core.contact_data import (
     to_world,
     write_surface_velocity,
 )
-from sph_ros.core.jit import device, inlined, parallel_kernel
+from sph_ros.core.jit import called, inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.sheets import (
     CORNER_CONTACTS,
@@ -63,7 +63,7 @@ def write_sheet_contact(shapes, sheets, motion, s, found, terms, row):
     return True
 
 
-@device
+@called
 def add_sheet_contacts(shapes, sheets, k, motion, x, y, z, inverse_step, contacts, row):
     """Write the contacts of a point with sheet k to the rows from `row` on, three at most.
 
@@ -112,7 +112,7 @@ def outside_grid(sheets, k, x, y, z):
 # ---------------------------------------------------------------- paths
 
 
-@device
+@called
 def keep_off(sheets, k, x, y, z, margin):
     """A point moved so far off sheet k that it keeps the margin, without going through it."""
     for _ in range(2):
@@ -127,7 +127,7 @@ def keep_off(sheets, k, x, y, z, margin):
     return x, y, z
 
 
-@device
+@called
 def stop_at_sheet(sheets, k, ax, ay, az, bx, by, bz, margin):
     """End of a path from a to b that stops at sheet k and slides along it, in the sheet's frame.
 
@@ -158,7 +158,7 @@ def stop_at_sheet(sheets, k, ax, ay, az, bx, by, bz, margin):
     return True, ax, ay, az
 
 
-@device
+@called
 def stop_chunk_at_sheets(chunk, starts, ends, clearance, sheets, motion, margin, scale, reactions):
     """`stop_at_sheets` for one chunk of particles."""
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, starts.shape[0])):
@@ -242,7 +242,7 @@ def is_behind(contacts, sheet_of, i, dx, dy, dz):
     return False
 
 
-@device
+@called
 def is_parted(sheets, motion, ax, ay, az, bx, by, bz):
     """Whether a sheet where it is now lies between two world points."""
     for k in range(sheets.solid.shape[0]):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
+from sph_ros.core.jit import called, inlined, kernel, parallel_kernel
 
 #: Triangles count as so much larger when a path is tested against them, as a share of their edges:
 #: no path slips through between two that share an edge.
@@ -185,7 +185,7 @@ def crossing_share(corners, t, ax, ay, az, dx, dy, dz):
     return share if 0.0 <= share <= 1.0 else NEVER
 
 
-@device
+@called
 def first_crossing(sheets, k, ax, ay, az, bx, by, bz):
     """Where the straight path from a to b first goes through sheet k, in the sheet's frame.
 
@@ -230,7 +230,7 @@ def edge_place(ax, ay, az, bx, by, bz):
     return min(max(share, 0.0), 1.0)
 
 
-@device
+@called
 def nearest_point(corners, normals, t, x, y, z):
     """The point of triangle t that is nearest to (x, y, z).
 
@@ -324,7 +324,7 @@ def nearest_in_cell(sheets, cell, x, y, z, reach, n0, n1):
     return best, bx, by, bz, part, found
 
 
-@device
+@called
 def nearest_on_sheet(sheets, k, x, y, z, reach):
     """`nearest_in_cell` of the first kind, for a point anywhere in the frame of sheet k."""
     none = (0.0, 0.0, 0.0)

@@ -328,7 +328,7 @@ def solid_terms(shapes, solid, x, y, z):
 
 
 @inlined
-def wall_terms(shapes, solid, x, y, z):
+def wall_terms(shapes, solid, x, y, z, within):
     """Distance to a solid and what it adds to the density and near-density of a particle.
 
     Args:
@@ -337,19 +337,19 @@ def wall_terms(shapes, solid, x, y, z):
         x: of the point in the solid's frame [m].
         y: of the point.
         z: of the point.
+        within: distance from which on only the distance is wanted, at most the support radius [m].
 
     Returns:
         (d, nx, ny, nz, f, fx, fy, fz, g, gx, gy, gz): signed distance [m] and unit normal out of
         the material; share of the rest density [-] and its gradient [1/m]; the same for the
         near-density. From the support radius on, d is only a lower bound that is at least the
-        support radius, and all else is zero.
+        support radius.
     """
     fx, fy, fz = np.float32(x), np.float32(y), np.float32(z)
-    d = outside_bounds(shapes, solid, fx, fy, fz)
-    node = np.int64(0)
+    d, node = outside_bounds(shapes, solid, fx, fy, fz), np.int64(0)
     if d < shapes.support_radius:
         d, node = distance_and_leaf(shapes, solid, fx, fy, fz)
-    if d >= shapes.support_radius:
+    if d >= within:
         o = _ZERO
         return d, o, o, o, o, o, o, o, o, o, o, o
     nx, ny, nz = leaf_normal(shapes, node, fx, fy, fz)
@@ -368,6 +368,8 @@ def wall_terms_at(shapes, solid, points, terms):  # the last one is written
         terms: (M, 12) float32.
     """
     for i in prange(points.shape[0]):
-        found = wall_terms(shapes, solid, points[i, 0], points[i, 1], points[i, 2])
+        found = wall_terms(
+            shapes, solid, points[i, 0], points[i, 1], points[i, 2], shapes.support_radius
+        )
         for column in range(12):
             terms[i, column] = found[column]

@@ -12,7 +12,7 @@ followed by a homography: the camera matrix, times the tilt of the sensor if the
 
 import numpy as np
 
-from sph_ros.core.jit import bare, bare_kernel
+from sph_ros.core.jit import bare_kernel, inlined
 
 
 class Lens:
@@ -88,7 +88,7 @@ def _monotonic_radius(coefficients):
     return max(float(r[bad[0]] if len(bad) else r[-1]), 1e-3)
 
 
-@bare
+@inlined
 def lens_point(x, y, lens):
     """Pixel of ideal image coordinates x = X/Z, y = Y/Z.
 

@@ -9,7 +9,7 @@ brighter.
 
 import numpy as np
 
-from sph_ros.core.jit import bare, bare_kernel
+from sph_ros.core.jit import bare_kernel, inlined
 from sph_ros.render.optics import LAMP, WATER_INDEX, refract
 
 #: Texels along the longer side of the map.
@@ -65,7 +65,7 @@ def _blurred(image):
     return 0.25 * (rows[:, :-2] + rows[:, 2:]) + 0.5 * rows[:, 1:-1]
 
 
-@bare
+@inlined
 def _deposit(image, place, x, y, area):
     """Add an area [m^2] of light at floor point (x, y), in units of a fully lit texel."""
     u = (x - place[0]) * place[2] - 0.5
@@ -80,7 +80,7 @@ def _deposit(image, place, x, y, area):
         image[i + 1, j + 1] += a * b * amount
 
 
-@bare
+@inlined
 def _floor_area(points, a, b, c, place):
     """Signed area [m^2] of a triangle's shadow on the floor, positive if lit from outside."""
     sx, sy = LAMP[0] / LAMP[2], LAMP[1] / LAMP[2]
@@ -91,7 +91,7 @@ def _floor_area(points, a, b, c, place):
     return 0.5 * (ux * vy - uy * vx)
 
 
-@bare
+@inlined
 def _sample_count(area, place):
     """Samples along an edge so that they lie about half a texel apart."""
     return int(min(max(2.0 * np.sqrt(2.0 * area) * place[2], 2.0), MAX_SAMPLES))

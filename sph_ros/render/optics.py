@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from sph_ros.core.jit import bare, device
+from sph_ros.core.jit import device, inlined
 
 #: Refractive index of water in visible light.
 WATER_INDEX = 1.333
@@ -79,7 +79,7 @@ def sky_colour(dx, dy, dz):
     return r, g, b
 
 
-@bare
+@inlined
 def light_at(x, y, light, origin_x, origin_y, texels_per_metre):
     """Lamp light on the floor, bilinear from the light map; 1 outside it."""
     u = (x - origin_x) * texels_per_metre - 0.5

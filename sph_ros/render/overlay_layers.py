@@ -7,7 +7,7 @@ for triangles of a few pixels. Large ones are cut up before (`subdivided`).
 
 import numpy as np
 
-from sph_ros.core.jit import bare, bare_kernel
+from sph_ros.core.jit import bare_kernel, inlined
 from sph_ros.render.lens import lens_point
 from sph_ros.render.raster import barycentric, interpolated_normal, span, winding_of
 
@@ -220,7 +220,7 @@ def draw_smooth_lines(ends, half_width, solid_depth, front, slack, covers):  # t
                 covers[layer, y, x] = max(covers[layer, y, x], min(cover, 1.0))
 
 
-@bare
+@inlined
 def image_point(x, y, z, view, lens):
     """Pixel (centres at whole numbers) and depth of a world point.
 

@@ -11,7 +11,7 @@ All colours are linear, blue green red as in the picture.
 
 import numpy as np
 
-from sph_ros.core.jit import bare, bare_kernel, device
+from sph_ros.core.jit import bare_kernel, device, inlined
 from sph_ros.render.optics import (
     LAMP,
     WATER_INDEX,
@@ -42,7 +42,7 @@ SKY = 1.1
 FAR = 6.0
 
 
-@bare
+@inlined
 def _direction(x, y, view):
     """World direction of a ray, one metre deep along the view axis."""
     return (
@@ -52,7 +52,7 @@ def _direction(x, y, view):
     )
 
 
-@bare
+@inlined
 def _desk_light(x, y, room, light):
     """Factor of the desk's brightness at (x, y) [m] under shadows and caustics."""
     lamp = light_at(x, y, light, room[2], room[3], room[4])
@@ -68,7 +68,7 @@ def _line_over(b, g, r, share, exposure):
     return b + share * (shine - b), g + share * (shine - g), r + share * (0.95 * shine - r)
 
 
-@bare
+@inlined
 def _shaded(x, y, normal, colour, rays, view, exposure):
     """Linear blue green red of a solid's surface at a pixel."""
     dx, dy, dz = _direction(rays[y, x, 0], rays[y, x, 1], view)
@@ -131,14 +131,14 @@ def draw_water(
             result[y, x, 2] = _display(r)
 
 
-@bare
+@inlined
 def _light(picture, y, x, share):
     """Linear blue green red of a pixel, times a share."""
     b, g, r = picture[y, x, 0] / 255.0, picture[y, x, 1] / 255.0, picture[y, x, 2] / 255.0
     return b * b * share, g * g * share, r * r * share
 
 
-@bare
+@inlined
 def _desk_light_at_pixel(x, y, rays, view, room, light):
     """Factor of a pixel's brightness if the desk is seen there."""
     dx, dy, dz = _direction(rays[y, x, 0], rays[y, x, 1], view)
@@ -177,7 +177,7 @@ def _towards_eye(nx, ny, nz, dx, dy, dz):
     return nx, ny, nz
 
 
-@bare
+@inlined
 def _water(x, y, picture, solids, liquid, line, rays, view, lens, room, light):
     """Linear blue green red of water at a pixel."""
     front, back, thickness = liquid
@@ -221,7 +221,7 @@ def _water(x, y, picture, solids, liquid, line, rays, view, lens, room, light):
     )
 
 
-@bare
+@inlined
 def _way_through(px, py, pz, tx, ty, tz, depth, solid_depth, back, view, lens):
     """How far the ray from entry point p in direction t goes through water, and where it ends.
 
@@ -243,7 +243,7 @@ def _way_through(px, py, pz, tx, ty, tz, depth, solid_depth, back, view, lens):
     return depth, i, j
 
 
-@bare
+@inlined
 def _seen(ox, oy, oz, dx, dy, dz, picture, view, lens, room, light):
     """Linear blue green red of the desk or the room that a ray from o in direction d meets.
 
@@ -272,7 +272,7 @@ def _seen(ox, oy, oz, dx, dy, dz, picture, view, lens, room, light):
     return b, g, r
 
 
-@bare
+@inlined
 def _sample(picture, u, v):
     """Linear colour (3 numbers) at a place in the picture, bilinear; outside, the border's."""
     height, width, _ = picture.shape
@@ -286,7 +286,7 @@ def _sample(picture, u, v):
     )
 
 
-@bare
+@inlined
 def _mixed(picture, i, j, k, a, b):
     """Square of the bilinear mean of four pixels; a from the top, b from the left."""
     top = picture[i, j, k] * (1.0 - b) + picture[i, j + 1, k] * b
@@ -324,7 +324,7 @@ def soften_edges(region, solids, liquid, rim, source, result):  # the last is wr
                 result[y, x, k] = np.uint8(value + white * (rim - value) + 0.5)
 
 
-@bare
+@inlined
 def _edge(y, x, v, u, solids, liquid):
     """1 where something ends between two pixels, 0.5 where the liquid's front bends sharply."""
     depth, _, index, _ = solids

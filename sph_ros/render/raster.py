@@ -8,7 +8,7 @@ rows, so the picture does not depend on the number of threads.
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import bare, device, parallel_kernel
+from sph_ros.core.jit import device, inlined, parallel_kernel
 from sph_ros.render.optics import LAMP, LAMP_LIGHT, SKY_LIGHT, lamp_glint, reflect
 
 #: Bands of rows per picture; more than threads, because the liquid fills only some.
@@ -76,7 +76,7 @@ def _inside(w, ax, ay, bx, by):
     return w > 0.0 or (w == 0.0 and (ax < bx or (ax == bx and ay < by)))
 
 
-@bare
+@inlined
 def barycentric(corners, t, winding, px, py):
     """Perspective-free weights of the corners at a pixel, and whether it is inside the triangle."""
     ax, ay = corners[t, 0, 0], corners[t, 0, 1]
@@ -96,7 +96,7 @@ def barycentric(corners, t, winding, px, py):
     return hit, u, v, w
 
 
-@bare
+@inlined
 def winding_of(corners, t):
     """Sign of the area in the image, whose y points down: -1 for a triangle seen from outside."""
     area = (corners[t, 1, 0] - corners[t, 0, 0]) * (corners[t, 2, 1] - corners[t, 0, 1]) - (
@@ -113,7 +113,7 @@ def span(a, b, c, first, last):
     return int(max(low, float(first))), int(min(high, last - 1.0)) + 1
 
 
-@bare
+@inlined
 def interpolated_normal(normals, t, u, v, w):
     """Unit normal of triangle t at weights u, v, w of its corners."""
     x = u * normals[t, 0, 0] + v * normals[t, 1, 0] + w * normals[t, 2, 0]
@@ -123,7 +123,7 @@ def interpolated_normal(normals, t, u, v, w):
     return x * scale, y * scale, z * scale
 
 
-@bare
+@inlined
 def shade_matt(colour, nx, ny, nz, dx, dy, dz):
     """Linear RGB of a slightly glossy solid: sky from above, lamp, glint (Lambert and Phong)."""
     lamp = max(nx * LAMP[0] + ny * LAMP[1] + nz * LAMP[2], 0.0)
@@ -183,7 +183,7 @@ def view_rays(camera, size) -> np.ndarray:
     return np.stack([camera.eye, corner, right / focal, down / focal])
 
 
-@bare
+@inlined
 def pixel_ray(view, x, y):
     """World direction through image point (x, y), one metre deep along the view axis."""
     return (
@@ -230,7 +230,7 @@ def draw_liquid(corners, normals, solid_depth, bands, front, back, thickness):  
                         _put_surface(back, y, x, z, normals, t, u, v, w)
 
 
-@bare
+@inlined
 def _put_surface(layer, y, x, z, normals, t, u, v, w):
     """Write depth and normal of triangle t into a layer (h, w, 4)."""
     nx, ny, nz = interpolated_normal(normals, t, u, v, w)
@@ -282,7 +282,7 @@ def draw_spheres(centres, radius, colours, view, focal, depth, picture):  # last
                         picture[y, x, 2] = b2
 
 
-@bare
+@inlined
 def _camera_to_world(view, focal, a, b, c):
     """Camera vector in the world frame; view's steps are right and down over focal."""
     fx = view[2, 1] * view[3, 2] - view[2, 2] * view[3, 1]
@@ -325,7 +325,7 @@ def draw_lines(ends, half_width, solid_depth, slack, cover):  # the last is writ
                             cover[y, x] = 1
 
 
-@bare
+@inlined
 def _row_of_line(ax, ay, bx, by, y, half_width, width):
     """Pixels of row y that a line may touch; `half_width` in pixels to either side."""
     low, high = min(ax, bx), max(ax, bx)

@@ -79,7 +79,7 @@ class ForcesSolver(LeapfrogSolver):
         self._clock("start")
         self._prepare(fluid)
         self._drift(fluid, time_step)
-        self._sort(fluid)
+        self._sort(fluid, self._work.predicted, self._work.predicted)
         self._clock("sort")
         self._find_contacts(time_step, fluid.clearance)
         self._clock("solids")

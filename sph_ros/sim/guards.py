@@ -96,11 +96,6 @@ def _with_bearable_tension(material, step, wanted, step_of, scene):
 # ---------------------------------------------------------------- a stop at the first NaN
 
 
-def all_numbers(*arrays):
-    """Whether every element of all arrays is a finite number."""
-    return all(np.isfinite(rows).all() for rows in arrays)
-
-
 class Guard:
     """Remembers the state before each step, and looks at what the step made of it."""
 

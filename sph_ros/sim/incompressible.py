@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sph_ros.core import neighbors as search
 from sph_ros.core import pressure as core
 from sph_ros.core import projection as project
 from sph_ros.core.weights import DENSITY_POWER, NEAR_POWER, SMOOTH_POWER
@@ -57,8 +56,9 @@ PACES = {
     SMOOTH_POWER: Pace(courant=0.4, surge=0.5, corrected=0.2, calming=0.005),
 }
 
-#: Share of the particles whose pressures do not count for the length of a step.
-PEAKS = 0.005
+#: Share of the particles whose pressures do not count for the length of a step, and of how many at
+#: most they are looked at.
+PEAKS, SAMPLE = 0.005, 8192
 
 #: Iterations end when the mean density error is this share of what the first guess left, at least
 #: `CALM` and at most 1 times the material's `compression`.
@@ -204,15 +204,9 @@ class IncompressibleSolver(PressureSolver):
             motion: the solids are where it ends; the present one unless given.
         """
         self._prepare_rows(fluid)
-        work = self._work
-        work.predicted[:] = fluid.positions
-        work.starts[:] = fluid.positions
-        # `displacements` has no use between steps.
-        work.displacements[:] = fluid.velocities
-        self._sort(fluid)
-        search.gather_rows(work.order, work.displacements, fluid.velocities)
+        self._sort(fluid, fluid.positions, fluid.positions)
         self._clock("sort")
-        self._find_contacts(1.0, fluid.clearance, motion)
+        self._find_contacts(math.inf, fluid.clearance, motion)
         self._clock("solids")
         self._find_neighbors()
         self._clock("neighbors")
@@ -232,7 +226,7 @@ class IncompressibleSolver(PressureSolver):
             super()._apply_viscosity(fluid, time_step)
             return
         work, unit = self._work, self._pressure_unit(time_step)
-        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        self._guess_pressures(fluid, unit)
         work.cohesive[:] = self._gravity * np.float32(time_step**2)
         # `starts` has no other use between the lists and the next positions.
         core.pressure_displacements(
@@ -259,8 +253,9 @@ class IncompressibleSolver(PressureSolver):
         self._pull_springs(fluid, time_step, time_step**2, work.cohesive)
         self._push_bodies(self._solids.bodies.inertias.centre)
         dt = np.float32(time_step)
-        project.push(fluid.velocities, self._gravity, dt, work.cohesive)
-        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        pulled = self._surface is not None or self._material.elasticity > 0.0
+        project.push(fluid.velocities, self._gravity, dt, pulled, work.cohesive)
+        self._guess_pressures(fluid, unit)
         pace = min(time_step / self._longest, 1.0)
         core.pressure_displacements(
             work.pairs,
@@ -293,8 +288,9 @@ class IncompressibleSolver(PressureSolver):
         self._iterate(work.targets, np.float32(0.0), goal, time_step, work.residuals)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         if len(fluid):
-            rank = int((1.0 - PEAKS) * (len(fluid) - 1))
-            self._pressed = float(np.partition(fluid.pressures, rank)[rank])
+            sample = fluid.pressures[:: -(-len(fluid) // SAMPLE)]
+            rank = int((1.0 - PEAKS) * (len(sample) - 1))
+            self._pressed = float(np.partition(sample, rank)[rank])
         self._push_bodies(self._solids.bodies.inertias.centre)
 
     def _pull_together(self, time_step):
@@ -304,8 +300,8 @@ class IncompressibleSolver(PressureSolver):
             self._surface.displace(
                 self._work, self._grid_now, motion, self._material, mass, time_step
             )
-        else:
-            self._work.cohesive[:] = 0.0
+        elif self._material.elasticity > 0.0:
+            self._work.cohesive[:] = 0.0  # for the springs to add to
 
     def _move(self, fluid, time_step):
         """New positions, outside all solids, and velocities."""

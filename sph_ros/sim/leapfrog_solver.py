@@ -94,13 +94,6 @@ class LeapfrogSolver(Solver):
                 fluid.velocities,
             )
             self._push_bodies()
-        work.starts[:] = work.predicted
-
-    def _sort(self, fluid):
-        """Order all rows by cell of the new positions, which become those of the fluid."""
-        velocities = fluid.velocities.copy()
-        super()._sort(fluid)
-        search.gather_rows(self._work.order, velocities, fluid.velocities)
 
     def _kick(self, fluid, time_step):
         """The second half of the kick."""
@@ -157,9 +150,7 @@ class LeapfrogSolver(Solver):
         """
         twin = fluid.copy()
         self._prepare_rows(twin)
-        self._work.predicted[:] = twin.positions
-        self._work.starts[:] = twin.positions
-        self._sort(twin)
+        self._sort(twin, twin.positions, twin.positions)
         self._find_contacts(1.0, np.zeros(len(twin), np.float32))
         self._find_neighbors()
         self._listed = None

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shapes -> arrays for the compiled functions of `core.distances` and `core.walls`."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sph_ros.core import distances as core
-from sph_ros.core.wall_tables import POWERS, TABLE_STEPS, WallTables
+from sph_ros.core.wall_tables import POWERS, TABLE_STEPS, WallTables, distances
 from sph_ros.sim.meshes import DistanceGrid, load_distance_grid
 from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shape_types import (
@@ -287,6 +288,25 @@ class _Packer:
             return side, self.tables.ball(radius, leaf.inverted)
         return 0, 0
 
+    def reaches(self, starts: Sequence[int]) -> list[float]:
+        """How far each solid acts [m]; the nodes of solid i are from starts[i] to starts[i + 1]."""
+        rows = distances(self.settings[0])
+        acts = [np.flatnonzero(table.any(axis=1)).max() for table in self.tables.stacked()]
+        of_table = [rows[min(last + 1, len(rows) - 1)] for last in acts]
+        leaves = [
+            [node for node in self.nodes[first:end] if node[0] < core.UNION]
+            for first, end in itertools.pairwise(starts)
+        ]
+        return [max((self._reach(node, of_table) for node in own), default=0.0) for own in leaves]
+
+    def _reach(self, node: tuple, of_table: list[float]) -> float:
+        """How far a leaf acts [m], from how far each table does."""
+        op, sign, _, _, tables, _ = node
+        if op in (core.BOX, core.CYLINDER) and sign > 0.0:
+            return self.settings[0]  # the distance to an edge says little of that to the sides
+        used = {core.SPHERE: tables[:1], core.CYLINDER: tables[:1], core.CAPSULE: tables}
+        return max(of_table[table] for table in (0, *used.get(op, ())))
+
     def _grid(self, leaf: _Leaf) -> int:
         key = (leaf.mesh, leaf.inverted)
         if key not in self.grids:
@@ -340,6 +360,7 @@ def pack_shapes(
         full_cover=_stacked(packer.tables.full_cover, np.float32, ()),
         solid_start=_stacked(starts, np.int32, ()),
         bounds=_stacked(bounds, np.float32, (4,)),
+        reach=_stacked(packer.reaches(starts), np.float32, ()),
         node_op=_stacked(op, np.int32, ()),
         node_sign=_stacked(sign, np.float32, ()),
         node_transform=_stacked(transform, np.float32, (3, 4)),

@@ -79,7 +79,7 @@ def solve_pressures(
 
     Args:
         work: `Workspace` with pairs, diagonal, the displacements without pressure in `cohesive`
-            and, in `scaled`, a first guess; `scaled` and `displacements` are written.
+            and a first guess by `scale_guess`; `scaled` and `displacements` are written.
         densities: without displacement, relative to rest [-], (N,).
         gradients: of the contacts, (N, 6).
         support_radius: h [m], float32.
@@ -93,8 +93,6 @@ def solve_pressures(
         Iterations taken, mean density error left, share to start from next time.
     """
     state = core.fresh_state(share)
-    work.guesses[:] = work.scaled
-    work.first[:] = work.scaled
     # Free bodies have to give way to each new guess.
     steps = MOST_ITERATIONS if coupling is None else 1
     while not state[core.DONE]:

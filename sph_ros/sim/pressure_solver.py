@@ -90,6 +90,11 @@ class PressureSolver(Solver):
         """Scaled pressure [m^2] per pressure [Pa]: dt^2 / (rho0 virial)."""
         return time_step**2 / (self.scales.rest_density * self.scales.virial * self._packing)
 
+    def _guess_pressures(self, fluid, unit):
+        """Let iterations begin with the last pressures; `unit` is the present one."""
+        work = self._work
+        core.scale_guess(fluid.pressures, np.float32(unit), work.scaled, work.guesses, work.first)
+
     def _sum_densities(self):
         work = self._work
         search.sum_densities(
@@ -210,7 +215,7 @@ class PressureSolver(Solver):
             self._coupling.drag_along(
                 fluid.velocities, rates.wall, rates.wall_quadratic, self.scales.mass
             )
-        apply_viscosity(self._work, fluid.velocities, rates, self._solids.motion)
+        apply_viscosity(self._work, fluid, rates, self._solids.motion)
         self._turn(fluid, time_step)
 
     def _turn(self, fluid, time_step):

@@ -50,7 +50,7 @@ class RelaxationSolver(PressureSolver):
         self._packing = packing(self._scene, time)
         self._clock("start")
         self._predict(fluid, time_step)
-        self._sort(fluid)
+        self._sort(fluid, self._work.starts, self._work.predicted)
         self._clock("sort")
         self._find_contacts(time_step, fluid.clearance)
         self._clock("solids")
@@ -96,10 +96,7 @@ class RelaxationSolver(PressureSolver):
     def _make_lists(self, fluid):
         """Sort a liquid that no step has sorted yet, and find its neighbours and contacts."""
         self._prepare(fluid)
-        work = self._work
-        work.predicted[:] = fluid.positions
-        work.starts[:] = fluid.positions
-        self._sort(fluid)
+        self._sort(fluid, fluid.positions, fluid.positions)
         self._find_contacts(1.0, np.zeros(len(fluid), np.float32))
         self._find_neighbors()
         self._listed = fluid
@@ -136,7 +133,7 @@ class RelaxationSolver(PressureSolver):
         self._couple(self._solids.bodies.centre, time_step)
         self._push_bodies()
         compliance = np.float32(1.0 / (self.scales.stiffness * unit))
-        np.multiply(fluid.pressures, np.float32(unit), out=work.scaled)
+        self._guess_pressures(fluid, unit)
         self._iterate(work.sums.density, compliance, self._goal(time_step), time_step)
         np.divide(work.scaled, np.float32(unit), out=fluid.pressures)
         self._push_bodies()

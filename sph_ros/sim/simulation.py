@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from sph_ros.core.neighbors import farthest_coordinates
+from sph_ros.core.rows import all_finite, farthest_coordinates
 from sph_ros.core.surface import extract_surface
 from sph_ros.sim.abilities import alike, faults
 from sph_ros.sim.emitters import Emitters
-from sph_ros.sim.guards import Guard, UnstableError, all_numbers, rescue_folder, rescue_name, tamed
+from sph_ros.sim.guards import Guard, UnstableError, rescue_folder, rescue_name, tamed
 from sph_ros.sim.jets import capacity
 from sph_ros.sim.kernels import ensure_compiled, needs, needs_of_material
 from sph_ros.sim.liquid import families, fill_blocks
@@ -80,6 +80,7 @@ class Simulation:
         self.time_step, self.time_step_reason = self._choose_time_step()
         self._steps = 0
         self._substeps = 1
+        self._reach = None  # that no particle is farther from the origin of the world [m]
         self._reactions = np.zeros((len(self._solids), 6))
         self._densities = None
         self._guard = Guard()
@@ -127,7 +128,8 @@ class Simulation:
         self._guard.remember(self._fluid, self._numbers(), self._solids)
         try:
             self._step()
-            good = all_numbers(self._fluid.positions, self._fluid.velocities, self._reactions)
+            arrays = self._fluid.positions, self._fluid.velocities, self._reactions
+            good = all(all_finite(rows) for rows in arrays)
         except UnstableError:
             good = False
         if not good:
@@ -163,20 +165,20 @@ class Simulation:
         self._reactions[:] = 0.0
         for part in range(count):
             now = self.time + part * duration
-            self._solids.advance(now, duration, fastest, self._liquid_reach())
+            self._solids.advance(now, duration, fastest, self._reach)
             self._next_id = self._emitters.advance(self._fluid, self._solids, now, self._next_id)
             self._reactions += self._solver.bounce(self._fluid, duration) / count
             self._reactions += self._solver.step(self._fluid, now, duration) / count
-            self._sinks.advance(self._fluid, now + duration)
+            self._reach = self._sinks.advance(self._fluid, now + duration)
         self.timings = self._solver.timings
         self._substeps = count
 
     def _substep_count(self):
         """Substeps that keep solids and particles within their reach, and the liquid stable."""
         dt = self.time_step
-        ahead = self._solids.distance_ahead(
-            self.time, dt, self.scene.max_solid_speed, self._liquid_reach()
-        )
+        if self._reach is None:
+            self._reach = math.hypot(*farthest_coordinates(self._fluid.positions))
+        ahead = self._solids.distance_ahead(self.time, dt, self.scene.max_solid_speed, self._reach)
         particle = max(self._solver.fastest, self._emitters.fastest(self.time)) * dt
         wanted = max(
             ahead / (SOLID_REACH * self.scene.spacing),
@@ -185,10 +187,6 @@ class Simulation:
         for_speed = min(max(math.ceil(wanted - 1e-6), 1), MOST_SUBSTEPS)
         stable = min(self._stable_step, self._solver.longest_step())
         return max(for_speed, math.ceil(dt / stable - 1e-6))
-
-    def _liquid_reach(self):
-        """Distance of the farthest particle from the origin of the world, at least [m]."""
-        return math.hypot(*farthest_coordinates(self._fluid.positions))
 
     def advance(self, seconds):
         """Advance by whole steps until at least `seconds` [s] more are simulated."""
@@ -241,6 +239,7 @@ class Simulation:
         simulation._steps = numbers["steps"]
         simulation.time_step, simulation.time_step_reason = numbers["time_step"]
         simulation._substeps = numbers["substeps"]
+        simulation._reach = None
         simulation._reactions[:] = np.reshape(numbers["reactions"], (-1, 6))
         simulation._solids.set_state(numbers)
         return simulation

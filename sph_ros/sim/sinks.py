@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where particles leave a scene: its sinks, and far away from everything."""
 
+import math
+
 import numpy as np
 
 from sph_ros.core.distances import signed_distances
-from sph_ros.core.neighbors import farthest_coordinates
+from sph_ros.core.rows import farthest_coordinates
 from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shapes import pack_shapes
 
@@ -44,9 +46,18 @@ class Sinks:
         self.removed, self.lost = state["removed"], state["lost"]
 
     def advance(self, fluid, now):
-        """Remove the particles that are in a sink at a time [s], or far away."""
-        if not self._sinks and max(farthest_coordinates(fluid.positions)) <= self._farthest():
-            return
+        """Remove the particles that are in a sink at a time [s], or far away.
+
+        Returns:
+            A distance that no particle is farther than from the origin of the world [m].
+        """
+        corner = farthest_coordinates(fluid.positions)
+        if self._sinks or not max(corner) <= self._farthest():
+            self._take(fluid, now)
+            corner = farthest_coordinates(fluid.positions)
+        return math.hypot(*corner)
+
+    def _take(self, fluid, now):
         taken = np.zeros(len(fluid), bool)
         for index, sink in enumerate(self._sinks):
             if sink.from_time <= now < sink.until and len(fluid):

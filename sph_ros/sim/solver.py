@@ -9,6 +9,7 @@ import numpy as np
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import sheet_contacts as sheets
+from sph_ros.core.rows import bounding_box
 from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim.abilities import alike
 from sph_ros.sim.guards import UnstableError
@@ -237,31 +238,27 @@ class Solver:
         )
         self.squeezed += int(work.squeezed.sum())
 
-    def _grid(self):
+    def _grid(self, positions):
         lower, upper = np.empty(3, np.float32), np.empty(3, np.float32)
-        bad = search.bounding_box(self._work.predicted, lower, upper)
+        bad = bounding_box(positions, lower, upper)
         if bad >= 0:
-            raise UnstableError(f"row {bad}: its position is {self._work.predicted[bad]}")
+            raise UnstableError(f"row {bad}: its position is {positions[bad]}")
         return make_grid(lower, upper, float(self._h), self._work.count)
 
-    def _sort(self, fluid):
-        """Order all rows by cell of the predicted positions; velocities stay as they are.
+    def _sort(self, fluid, starts, ends):
+        """Order all rows by cell.
 
-        Written are positions (from `starts`), predicted positions of the workspace and `columns`.
+        Args:
+            fluid: its rows are put in the new order.
+            starts: what its positions are to be, in the old order [m], (N, 3).
+            ends: the positions that are sorted by [m], (N, 3); those become `predicted` and
+                `columns` of the workspace.
         """
         work = self._work
-        self._grid_now = grid = self._grid()
-        search.sort_by_cell(work.predicted, grid, work.cell_of, work.order)
-        search.gather_positions(
-            work.order,
-            work.starts,
-            work.predicted,
-            fluid.positions,
-            work.scratch,
-            work.columns,
-        )
+        self._grid_now = grid = self._grid(ends)
+        search.sort_by_cell(ends, grid, work.cell_of, work.order)
+        fluid.reorder(starts, ends, work)
         work.predicted, work.scratch = work.scratch, work.predicted
-        fluid.reorder(work.order, work)
         self._weigh(fluid)
 
     def _find_contacts(self, time_step, clearance, motion=None):

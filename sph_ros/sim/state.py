@@ -4,8 +4,9 @@
 import numpy as np
 
 from sph_ros.core.contacts import TERMS, Contacts
-from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count, gather_values
+from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count
 from sph_ros.core.pair_sums import Pairs
+from sph_ros.core.rows import gather_state
 from sph_ros.core.vector import LANES
 
 #: Cells of a grid; beyond, its outermost cells hold what lies farther out.
@@ -26,7 +27,9 @@ class Fluid:
     """The liquid: one row per particle, sorted by cell.
 
     There is room for `capacity` particles from the start; the arrays are views of those that exist.
-    Change them in place: assigning another array would cut the view off from the room behind it.
+    Change them in place: assigning another array would cut the view off from the room behind it. Of
+    those in `ROWS` there is a `spare` twin each, to write what is new while the old is still read;
+    `swap` then lets the two change places, so keep no view across a step.
 
     Attributes:
         positions: [m], world frame, (N, 3) float32.
@@ -61,6 +64,7 @@ class Fluid:
             name: np.zeros((self.capacity, columns) if columns else self.capacity, kind)
             for name, (columns, kind) in self.ROWS.items()
         }
+        self._spare = {name: np.zeros_like(rows) for name, rows in self._store.items()}
         self._store["ids"] = np.zeros(self.capacity, np.uint32)
         self._resize(count)
         self.positions[:] = np.reshape(positions, (count, 3))
@@ -72,6 +76,16 @@ class Fluid:
     def _resize(self, count):
         for name, rows in self._store.items():
             setattr(self, name, rows[:count])
+
+    def spare(self, name):
+        """An array like the one called `name`, for what that becomes; what is in it is no use."""
+        return self._spare[name][: len(self)]
+
+    def swap(self, *names):
+        """Let the spare arrays be those of the liquid, and these spare."""
+        for name in names:
+            self._store[name], self._spare[name] = self._spare[name], self._store[name]
+            setattr(self, name, self._store[name][: len(getattr(self, name))])
 
     def __len__(self):
         """Number of particles."""
@@ -104,20 +118,22 @@ class Fluid:
         result[self.particle] = rows
         return result
 
-    def reorder(self, order, work):
-        """Let row k be what was row order[k], in all arrays but positions and velocities.
+    def reorder(self, starts, ends, work):
+        """Let row k be what was row order[k].
 
         Args:
-            order: (N,) int32.
-            work: `Workspace`; of its arrays `diagonal`, `residuals` and `cell_of` are used.
+            starts, ends: see `gather_state`; `positions` become the sorted starts.
+            work: `Workspace` with the order; its `scratch` becomes the sorted ends, its `columns`
+                these once more.
         """
-        sorted_rows = work.diagonal, work.residuals, work.cell_of
-        rows = self.pressures, self.clearance, self.particle
-        gather_values(order, *rows, *sorted_rows)
-        for old, new in zip(rows, sorted_rows, strict=True):
-            old[:] = new
+        old = self.velocities, self.pressures, self.clearance, self.particle
+        new = (self.spare(name) for name in ("velocities", "pressures", "clearance", "particle"))
+        spare = self.spare("positions")
+        ends_again = work.scratch, work.columns
+        gather_state(work.order, starts, ends, *old, spare, *ends_again, *new)
+        self.swap(*self.ROWS)
         for rows in self.extras.values():
-            rows[:] = rows.take(order, axis=0, mode="clip")  # the fastest of numpy's ways
+            rows[:] = rows.take(work.order, axis=0, mode="clip")  # the fastest of numpy's ways
 
     def add(self, positions, velocities, ids):
         """Append particles whose ids are higher than all others; other rows of theirs are 0."""
@@ -229,8 +245,8 @@ class Workspace:
         )
         room = chunks * CHUNK * self.slots
         self._contacts = Contacts(
-            np.zeros(capacity, np.int64),
-            np.zeros(capacity, np.int64),
+            np.zeros(capacity, np.int32),
+            np.zeros(capacity, np.int32),
             np.empty(room, np.int32),
             np.empty((room, TERMS), np.float32),
             np.zeros((capacity, 2), np.float32),

@@ -45,13 +45,13 @@ class Rates(NamedTuple):
         return self.linear * self.neighbors > EXPLICIT_LIMIT
 
 
-def apply_viscosity(work, velocities, rates, motion):
+def apply_viscosity(work, fluid, rates, motion):
     """Let pairs of neighbours share their velocities, and solids take theirs.
 
     Args:
         work: `Workspace` with pairs and contacts; its scratch arrays are used, its reactions added
             to.
-        velocities: [m/s], (N, 3); changed.
+        fluid: its velocities are changed.
         rates: `Rates`.
         motion: of the solids.
     """
@@ -60,15 +60,15 @@ def apply_viscosity(work, velocities, rates, motion):
         relax.viscous_impulses(
             work.pairs,
             work.columns,
-            velocities,
+            fluid.velocities,
             np.float32(rates.support_radius),
             np.float32(0.0 if implicit else rates.linear),
             np.float32(rates.quadratic),
             np.float32(MOST_TAKEN / rates.neighbors),
-            work.scratch,
+            fluid.spare("velocities"),
         )
-        velocities[:] = work.scratch
-    touching = len(motion.position) > 0
+        fluid.swap("velocities")
+    velocities, touching = fluid.velocities, len(motion.position) > 0
     if implicit:
         _solve_implicitly(work, velocities, rates, touching)
         if touching:
