@@ -25,10 +25,11 @@ from sph_ros.core.contact_data import (
     to_world,
     write_surface_velocity,
 )
-from sph_ros.core.distances import distance_and_normal, signed_distance
+from sph_ros.core.distances import normal_called, signed_distance
 from sph_ros.core.jit import called, inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.sheet_contacts import add_sheet_contacts
+from sph_ros.core.thin_films import add_film_walls, add_films
 from sph_ros.core.walls import wall_terms
 
 __all__ = ["TERMS", "Contacts", "Motion"]
@@ -91,21 +92,30 @@ def find_contacts_of_chunk(
     """`find_contacts` for one chunk of particles; a function of its own compiles faster."""
     solids = motion.position.shape[0]
     cursor = chunk * CHUNK * slots
-    reach = shapes.support_radius if sheets.solid.shape[0] > 0 else np.float32(0.0)
+    # Who is in a film has one of its walls within half the gap.
+    reach = np.float32(0.5) * shapes.film_gap
+    if sheets.solid.shape[0] > 0:
+        reach = shapes.support_radius
     for s in range(solids):
         reach = max(reach, shapes.reach[s])
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        contacts.start[i] = cursor
+        contacts.start[i] = bodies = cursor
         if clearance[i] < reach:
-            nearest = np.float32(np.inf)
+            nearest = next_nearest = np.float32(np.inf)
             for s in range(solids):
                 near, distance = add_contact(
                     shapes, motion, s, x, y, z, inverse_step, contacts.solid, contacts.terms, cursor
                 )
+                next_nearest = min(next_nearest, max(nearest, distance))
                 nearest = min(nearest, distance)
                 if near:
                     cursor += 1
+            if nearest + next_nearest < shapes.film_gap:
+                cursor = add_film_walls(
+                    shapes, motion, x, y, z, inverse_step, contacts, bodies, cursor
+                )
+            bodies = cursor
             for k in range(sheets.solid.shape[0]):
                 rows, distance = add_sheet_contacts(
                     shapes, sheets, k, motion, x, y, z, inverse_step, contacts, cursor
@@ -115,6 +125,8 @@ def find_contacts_of_chunk(
             clearance[i] = nearest
         contacts.end[i] = cursor
         combine_contacts(contacts, packing, i, contacts.start[i], cursor)
+        if contacts.start[i] + 1 < bodies:
+            add_films(contacts, shapes, packing, i, contacts.start[i], bodies)
 
 
 @parallel_kernel
@@ -254,12 +266,6 @@ def distance_called(shapes, s, x, y, z):
     time to compile.
     """
     return signed_distance(shapes, s, x, y, z)
-
-
-@called
-def normal_called(shapes, s, x, y, z):
-    """`distance_and_normal` as a function of its own."""
-    return distance_and_normal(shapes, s, x, y, z)
 
 
 @called

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import called, inlined, parallel_kernel
 
 SPHERE, BOX, CAPSULE, CYLINDER, PLANE, GRID, UNION, INTERSECTION = range(8)
 
@@ -51,6 +51,8 @@ class PackedShapes(NamedTuple):
             ends, (N, 2).
         node_grid: distance grid of a leaf, or -1, (N,).
         tables: wall shares over distance, see `wall_tables`, (T, rows, 2).
+        film_gap: at which films between two solids end [m], float32; 0: there are none.
+        film: what films lack of the density, over their gap, see `thin_film_tables`, (rows,).
         grid_origin: position of the first sample in the leaf's frame [m], (G, 3).
         grid_cell: sample spacing [m], (G,).
         grid_shape: samples along x, y, z, (G, 3).
@@ -72,6 +74,8 @@ class PackedShapes(NamedTuple):
     node_table: np.ndarray
     node_grid: np.ndarray
     tables: np.ndarray
+    film_gap: np.float32
+    film: np.ndarray
     grid_origin: np.ndarray
     grid_cell: np.ndarray
     grid_shape: np.ndarray
@@ -319,6 +323,12 @@ def distance_and_normal(shapes, solid, x, y, z):
     distance, node = distance_and_leaf(shapes, solid, fx, fy, fz)
     nx, ny, nz = leaf_normal(shapes, node, fx, fy, fz)
     return distance, nx, ny, nz
+
+
+@called
+def normal_called(shapes, solid, x, y, z):
+    """`distance_and_normal` as a function of its own: inlined everywhere it compiles for long."""
+    return distance_and_normal(shapes, solid, x, y, z)
 
 
 @inlined

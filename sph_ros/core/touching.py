@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sph_ros.core.contact_data import rotate, to_solid, to_world
-from sph_ros.core.contacts import normal_called
+from sph_ros.core.distances import normal_called
 from sph_ros.core.jit import device, kernel
 
 #: Touches of one pair of solids at most, and candidates they are chosen from.

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sph_ros.core import distances as core
+from sph_ros.core.thin_film_tables import film_table
 from sph_ros.core.wall_tables import POWERS, TABLE_STEPS, WallTables, distances
+from sph_ros.core.weights import SMOOTH_POWER
 from sph_ros.sim.meshes import DistanceGrid, load_distance_grid
 from sph_ros.sim.quaternions import to_matrix
 from sph_ros.sim.shape_types import (
@@ -352,6 +354,9 @@ def pack_shapes(
         centre, radius = packer.add(shape)
         bounds.append((*centre, min(radius, _UNBOUNDED)))
         starts.append(len(packer.nodes))
+    gap, film = 0.0, np.zeros(2)
+    if weights[0] == SMOOTH_POWER and len(shapes) > 1:
+        gap, film = film_table(float(support_radius), float(spacing), dimension, weights)
     nodes = packer.nodes
     op, sign, transform, size, table, grid = zip(*nodes, strict=True) if nodes else [()] * 6
     return core.PackedShapes(
@@ -368,6 +373,8 @@ def pack_shapes(
         node_table=_stacked(table, np.int32, (2,)),
         node_grid=_stacked(grid, np.int32, ()),
         tables=packer.tables.stacked(),
+        film_gap=np.float32(gap),
+        film=_stacked(film, np.float32, ()),
         **_packed_grids([grid for _, grid in packer.grids.values()], packer.tables.columns),
     )
 
