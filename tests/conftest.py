@@ -16,7 +16,7 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="sph_ros_log_"))
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# A shell starts what runs in the background deaf to Ctrl-C, and children inherit that; tests press it.
+# A shell starts background jobs deaf to Ctrl-C, which children inherit; tests press it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
