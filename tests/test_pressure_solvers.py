@@ -94,15 +94,13 @@ def test_targets_make_the_linear_density_right_at_the_expected_displacements():
     generator = np.random.default_rng(3)
     shift = generator.normal(0.0, 0.1 * scene.spacing, work.displacements.shape)
     work.displacements[:] = shift
-    h = np.float32(scene.support_radius)
     none = np.zeros_like(work.scaled), work.contacts.gradients, work.displacements.copy()
-    pressure.pressure_displacements(work.pairs, *none, h, work.displacements, work.packed)
+    pressure.pressure_displacements(work.pairs, *none, work.displacements)
     scale = sim._solver.scales.density_scale * sim._solver._packing
     project.density_targets(
-        work.columns,
+        work.predicted,
         work.displacements,
-        work.packed,
-        h,
+        np.float32(scene.support_radius),
         np.float32(sim._solver._power),
         np.float32(scale),
         work.pairs,

@@ -155,7 +155,7 @@ def test_however_the_particles_lie_rubbing_takes_energy_and_a_rigid_rotation_doe
     def rub(velocities, spins, strength, radius):
         core.rub_spins(
             work.pairs,
-            work.columns,
+            work.predicted,
             work.sums,
             velocities,
             np.float32(determinant * scale**3),

@@ -26,7 +26,7 @@ from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of
 from sph_ros.core.vector import LANES, inverse_root, larger, smaller, spread
-from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, store, take
+from sph_ros.core.vector_memory import gather, gather_points, load, put, store, take, take_points
 
 
 class State(NamedTuple):
@@ -88,11 +88,11 @@ class Factors(NamedTuple):
 
 
 @parallel_kernel
-def sum_densities(columns, velocities, support_radius, factors, pairs, state):
+def sum_densities(positions, velocities, support_radius, factors, pairs, state):
     """Pair geometry, densities and their rates of change (Mueller et al. 2003, eq. 3).
 
     Args:
-        columns: cell-sorted coordinates [m], (3, N + padding).
+        positions: [m], (N, 3), those of the lists.
         velocities: [m/s], (N, 3).
         support_radius: h [m], float32.
         factors: `Factors`.
@@ -104,19 +104,17 @@ def sum_densities(columns, velocities, support_radius, factors, pairs, state):
     density_scale, spiky_scale = factors.density_scale, factors.spiky_scale
     # Gradient of poly6 over that of spiky, per q (2 - u)^2.
     ratio = -factors.colour_slope
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    density, rate, count = state.density, state.rate, pairs.start.shape[0]
+    density, rate = state.density, state.rate
     pairs.unit[0] = -spiky_scale / STEPS
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows = lanes_from(first, count)
-        x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
-        vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
-        vz = gather_column(velocities, rows, 2)
+        x, y, z = take_points(positions, first, 0)
+        vx, vy, vz = take_points(velocities, first, 0)
         w, change = spread(zero), spread(zero)
         for k in range(pairs.start[first], pairs.stop[s], LANES):
             j = load(pairs.neighbors, k)
-            dx, dy, dz = x - gather(xs, j), y - gather(ys, j), z - gather(zs, j)
+            dx, dy, dz = gather_points(positions, j)
+            dx, dy, dz = x - dx, y - dy, z - dz
             r2 = dx * dx + dy * dy + dz * dz + TINY
             inverse_r = inverse_root(r2)
             u = larger(one - inverse_h * (r2 * inverse_r), spread(zero))
@@ -128,9 +126,10 @@ def sum_densities(columns, velocities, support_radius, factors, pairs, state):
             store(STEPS * dz, pairs.z, k)
             c = u * (two - u)
             w += c * c * c
-            along = dx * (vx - gather_column(velocities, j, 0))
-            along += dy * (vy - gather_column(velocities, j, 1))
-            along += dz * (vz - gather_column(velocities, j, 2))
+            ux, uy, uz = gather_points(velocities, j)
+            along = dx * (vx - ux)
+            along += dy * (vy - uy)
+            along += dz * (vz - uz)
             change += (one - u) * (two - u) * (two - u) * along
         # Each entry that only fills the list has counted as the particle itself, with weight 1.
         put(density_scale * (w - filling_of(pairs, first)), density, first)
@@ -186,28 +185,25 @@ def pair_forces(pairs, velocities, factors, contact_gradients, state, accelerati
         accelerations: [m/s^2], (N, 3); written.
     """
     pressure, volume, viscosity = state.pressure, state.volume, state.viscosity
-    lightness, walls, count = state.lightness, contact_gradients, state.pressure.shape[0]
+    lightness, walls = state.lightness, contact_gradients
     half_drag, push = np.float32(0.5) * factors.drag, factors.push
     zero, step = np.float32(0.0), np.float32(1.0) / STEPS
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows = lanes_from(first, count)
         p, mu, own, unit = (
             take(pressure, first),
             take(viscosity, first),
             take(volume, first),
             pairs.unit[0],
         )
-        vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
-        vz = gather_column(velocities, rows, 2)
+        vx, vy, vz = take_points(velocities, first, 0)
         ax, ay, az = spread(zero), spread(zero), spread(zero)
         for k in range(pairs.start[first], pairs.stop[s], LANES):
             j = load(pairs.neighbors, k)
             u = step * load(pairs.nearness, k)
             x, y, z = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
-            dx = vx - gather_column(velocities, j, 0)
-            dy = vy - gather_column(velocities, j, 1)
-            dz = vz - gather_column(velocities, j, 2)
+            dx, dy, dz = gather_points(velocities, j)
+            dx, dy, dz = vx - dx, vy - dy, vz - dz
             along = smaller(dx * x + dy * y + dz * z, spread(zero))
             approach = step * along / (u * u + np.float32(1e-6))
             there = gather(volume, j)
@@ -219,10 +215,9 @@ def pair_forces(pairs, velocities, factors, contact_gradients, state, accelerati
             az -= both * z + share * dz
         wall = push * own * p
         scale = own * take(lightness, first)
-        ax = scale * (ax - wall * gather_column(walls, rows, 3))
-        ay = scale * (ay - wall * gather_column(walls, rows, 4))
-        az = scale * (az - wall * gather_column(walls, rows, 5))
-        put((ax, ay, az), accelerations, first)
+        wx, wy, wz = take_points(walls, first, 3)
+        ax, ay, az = ax - wall * wx, ay - wall * wy, az - wall * wz
+        put((scale * ax, scale * ay, scale * az), accelerations, first)
 
 
 @parallel_kernel

@@ -16,7 +16,17 @@ from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
 from sph_ros.core.near_points import append_within
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
 from sph_ros.core.vector import LANES, inverse_root, larger, spread, where_whole
-from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, store, take
+from sph_ros.core.vector_memory import (
+    gather,
+    gather_column,
+    gather_points,
+    lanes_from,
+    load,
+    put,
+    store,
+    take,
+    take_points,
+)
 
 #: Particles handled by one piece of parallel work, whole slices; fixed, so that no sum depends on
 #: the threads.
@@ -218,12 +228,12 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
 
 @parallel_kernel
 def sum_densities(
-    columns, support_radius, power, density_scale, near_scale, wall_density, chunks, pairs, sums
+    positions, support_radius, power, density_scale, near_scale, wall_density, chunks, pairs, sums
 ):
     """Pair geometry, both densities and gradient sums of every particle (Clavet 2005, Alg. 2).
 
     Args:
-        columns: as in `find_neighbors`.
+        positions: [m], (N, 3), those of the lists.
         support_radius: h [m], float32.
         power: of the density's weight (1 - r/h)^power, 2 or 3, float32.
         density_scale, near_scale: 1 / lattice sums of the two weights [-], float32.
@@ -241,7 +251,7 @@ def sum_densities(
     pairs.unit[0] = slope / STEPS
     for chunk in prange(chunks):
         for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
-            w, n, square, x, y, z = geometry_of_pairs(pairs, columns, first, inverse_h, bend)
+            w, n, square, x, y, z = geometry_of_pairs(pairs, positions, first, inverse_h, bend)
             rows = lanes_from(first, count)
             put(density_scale * w + gather_column(wall_density, rows, 0), density, first)
             put(near_scale * n + gather_column(wall_density, rows, 1), near_density, first)
@@ -278,20 +288,18 @@ def densities_of_pairs(
     for s in prange((count + LANES - 1) // LANES):
         first = s * LANES
         rows = lanes_from(first, count)
-        x, y = gather_column(positions, rows, 0), gather_column(positions, rows, 1)
-        z = gather_column(positions, rows, 2)
+        x, y, z = take_points(positions, first, 0)
         weights = spread(zero)
         for k in range(pairs.start[first], pairs.stop[s], LANES):
             j = load(pairs.neighbors, k)
-            dx = x - gather_column(positions, j, 0)
-            dy = y - gather_column(positions, j, 1)
-            dz = z - gather_column(positions, j, 2)
+            dx, dy, dz = gather_points(positions, j)
+            dx, dy, dz = x - dx, y - dy, z - dz
             r2 = dx * dx + dy * dy + dz * dz + TINY
             u = larger(one - inverse_h * (r2 * inverse_root(r2)), spread(zero))
             weights += u * u
+        gx, gy, gz = take_points(wall_gradients, first, 0)
+        lx, ly, lz = take_points(listed, first, 0)
         wall = gather_column(wall_density, rows, 0)
-        wall += gather_column(wall_gradients, rows, 0) * (x - gather_column(listed, rows, 0))
-        wall += gather_column(wall_gradients, rows, 1) * (y - gather_column(listed, rows, 1))
-        wall += gather_column(wall_gradients, rows, 2) * (z - gather_column(listed, rows, 2))
+        wall += gx * (x - lx) + gy * (y - ly) + gz * (z - lz)
         weights = density_scale * (weights - filling_of(pairs, first))
         put(weights + larger(wall, spread(zero)), density, first)

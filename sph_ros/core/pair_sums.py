@@ -3,9 +3,8 @@
 
 Lists are stored in slices of sixteen particles (`Pairs`), so that each lane of a vector belongs to
 one particle and nothing is ever summed across lanes. Time then goes into reading: what belongs to
-the neighbours, one element at a time, and the lists themselves, which no cache near the processor
-holds. So a displacement is read as one word of fixed-point numbers (`pack`), a third of the
-elements, and gradients are kept in 16 bits.
+the neighbours, one row at a time, and the lists themselves, which no cache near the processor
+holds. So rows are read whole (`gather_points`), and gradients are kept in 16 bits.
 """
 
 from typing import NamedTuple
@@ -13,29 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sph_ros.core.jit import inlined
-from sph_ros.core.vector import (
-    LANES,
-    as_floats,
-    inverse_root,
-    larger,
-    root,
-    rounded,
-    smaller,
-    spread,
-)
-from sph_ros.core.vector_memory import (
-    gather,
-    gather_column,
-    gather_words,
-    lanes_from,
-    load,
-    store,
-    take,
-)
-
-#: Numbers in a packed displacement are whole multiples of `REACH` support radii / 2^20.
-REACH = np.float32(4.0)
-LARGEST = np.float32((1 << 20) - 1)
+from sph_ros.core.vector import LANES, as_floats, inverse_root, larger, root, smaller, spread
+from sph_ros.core.vector_memory import gather, gather_points, load, store, take, take_points
 
 #: Gradients and nearness are kept as whole multiples of 1 / `STEPS` of the largest.
 STEPS = np.float32(32767.0)
@@ -75,37 +53,6 @@ class Pairs(NamedTuple):
 
 
 @inlined
-def resolution(support_radius):
-    """Length of the unit of packed displacements [m]."""
-    return support_radius * REACH / np.float32(1 << 20)
-
-
-@inlined
-def _whole(value, inverse):
-    """`value` in units of 1 / `inverse`, a whole number; what does not fit becomes the largest."""
-    return rounded(larger(smaller(value * inverse, spread(LARGEST)), spread(-LARGEST)))
-
-
-@inlined
-def pack(x, y, z, support_radius):
-    """Displacements [m] as words, in a lower and an upper half: x and y in 21 bits each, z in 22.
-
-    The lower half holds x and half of z, the upper one y and the rest of z.
-    """
-    inverse = np.float32(1.0) / resolution(support_radius)
-    z_bits = _whole(z, inverse) + (1 << 20)
-    low = (_whole(x, inverse) << 11) | (z_bits & 0x7FF)
-    return low, (_whole(y, inverse) << 11) | (z_bits >> 11)
-
-
-@inlined
-def unpacked(low, high):
-    """Components of packed displacements, whole numbers in their unit."""
-    z = (((high & 0x7FF) << 11) | (low & 0x7FF)) - (1 << 20)
-    return as_floats(low >> 11), as_floats(high >> 11), as_floats(z)
-
-
-@inlined
 def filling_of(pairs, first):
     """Entries that only fill up the lists of the slice that begins at particle `first`."""
     width = np.int64(pairs.stop[first // LANES]) - np.int64(pairs.start[first])
@@ -137,30 +84,26 @@ def push_by_pairs(pairs, values, first):
 
 
 @inlined
-def divergence_of_pairs(pairs, packed, first, support_radius):
+def divergence_of_pairs(pairs, displacements, first):
     """Sum of g_ij . (w_i - w_j) over the neighbours of a slice: how much denser it gets [-].
 
     Args:
         pairs: from `sum_densities`.
-        packed: displacements w by `pack`, (N,) int64.
+        displacements: w [m], (N, 3).
         first: particle of the slice.
-        support_radius: h [m], float32.
     """
-    rows = lanes_from(first, packed.shape[0])
-    low, high = gather_words(packed, rows)
-    x, y, z = unpacked(low, high)
+    x, y, z = take_points(displacements, first, 0)
     change = spread(np.float32(0.0))
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
-        low, high = gather_words(packed, load(pairs.neighbors, k))
-        there_x, there_y, there_z = unpacked(low, high)
+        there_x, there_y, there_z = gather_points(displacements, load(pairs.neighbors, k))
         change += load(pairs.x, k) * (x - there_x)
         change += load(pairs.y, k) * (y - there_y)
         change += load(pairs.z, k) * (z - there_z)
-    return (pairs.unit[0] * resolution(support_radius)) * change
+    return pairs.unit[0] * change
 
 
 @inlined
-def impulse_of_pairs(pairs, columns, velocities, first, inverse_h, linear, quadratic, most):
+def impulse_of_pairs(pairs, positions, velocities, first, inverse_h, linear, quadratic, most):
     """Sum of (1 - r/h) q_ij n_ij ((v_i - v_j) . n_ij) over the neighbours of a slice, x, y, z.
 
     With n_ij the direction from j to i; q_ij = min(linear + quadratic c_ij, most), and c_ij the
@@ -169,27 +112,26 @@ def impulse_of_pairs(pairs, columns, velocities, first, inverse_h, linear, quadr
 
     Args:
         pairs: from `find_neighbors`.
-        columns: coordinates [m], as there.
+        positions: [m], (N, 3), those of the lists.
         velocities: [m/s], (N, 3).
         first: particle of the slice.
         inverse_h: 1 / h [1/m], float32.
         linear, quadratic, most: float32.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    rows = lanes_from(first, velocities.shape[0])
-    px, py, pz = gather(xs, rows), gather(ys, rows), gather(zs, rows)
-    vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
-    vz = gather_column(velocities, rows, 2)
+    px, py, pz = take_points(positions, first, 0)
+    vx, vy, vz = take_points(velocities, first, 0)
     ax, ay, az = spread(zero), spread(zero), spread(zero)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
         j = load(pairs.neighbors, k)
-        x, y, z = px - gather(xs, j), py - gather(ys, j), pz - gather(zs, j)
+        x, y, z = gather_points(positions, j)
+        x, y, z = px - x, py - y, pz - z
         r2 = x * x + y * y + z * z + TINY
         inverse_r = inverse_root(r2)
-        along = (vx - gather_column(velocities, j, 0)) * x
-        along += (vy - gather_column(velocities, j, 1)) * y
-        along += (vz - gather_column(velocities, j, 2)) * z
+        u, v, w = gather_points(velocities, j)
+        along = (vx - u) * x
+        along += (vy - v) * y
+        along += (vz - w) * z
         along *= inverse_r
         taken = smaller(linear - quadratic * smaller(along, spread(zero)), spread(most))
         share = (one - inverse_h * (r2 * inverse_r)) * taken * along * inverse_r
@@ -200,48 +142,44 @@ def impulse_of_pairs(pairs, columns, velocities, first, inverse_h, linear, quadr
 
 
 @inlined
-def weights_after(pairs, columns, packed, first, support_radius, bend):
+def weights_after(pairs, positions, displacements, first, support_radius, bend):
     """Sums of a slice's weights after displacements, and how they grow to first order.
 
     The second is in units of density, see `divergence_of_pairs`.
 
     Args:
-        pairs, packed, first, support_radius: as in `divergence_of_pairs`.
-        columns: coordinates before [m], as in `find_neighbors`.
+        pairs, displacements, first: as in `divergence_of_pairs`.
+        positions: before [m], (N, 3), those of the lists.
+        support_radius: h [m], float32.
         bend: as in `geometry_of_pairs`.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
-    inverse_h, unit = one / support_radius, resolution(support_radius)
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    rows = lanes_from(first, packed.shape[0])
-    x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
-    low, high = gather_words(packed, rows)
-    ux, uy, uz = unpacked(low, high)
+    inverse_h = one / support_radius
+    x, y, z = take_points(positions, first, 0)
+    ux, uy, uz = take_points(displacements, first, 0)
     weights, linear = spread(zero), spread(zero)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
         j = load(pairs.neighbors, k)
-        low, high = gather_words(packed, j)
-        mx, my, mz = unpacked(low, high)
+        mx, my, mz = gather_points(displacements, j)
         mx, my, mz = ux - mx, uy - my, uz - mz
         linear += load(pairs.x, k) * mx
         linear += load(pairs.y, k) * my
         linear += load(pairs.z, k) * mz
-        dx = x - gather(xs, j) + unit * mx
-        dy = y - gather(ys, j) + unit * my
-        dz = z - gather(zs, j) + unit * mz
+        dx, dy, dz = gather_points(positions, j)
+        dx, dy, dz = x - dx + mx, y - dy + my, z - dz + mz
         u = one - inverse_h * root(dx * dx + dy * dy + dz * dz)
         u = larger(u, spread(zero))
         weights += u * u * (one + bend * (u - one))
-    return weights - filling_of(pairs, first), (pairs.unit[0] * unit) * linear
+    return weights - filling_of(pairs, first), pairs.unit[0] * linear
 
 
 @inlined
-def geometry_of_pairs(pairs, columns, first, inverse_h, bend):
+def geometry_of_pairs(pairs, positions, first, inverse_h, bend):
     """Gradients of the pairs of a slice, and sums over them.
 
     Args:
         pairs: all of the slice but the lists is written.
-        columns: coordinates [m], as in `find_neighbors`.
+        positions: [m], (N, 3), those of the lists.
         first: particle of the slice.
         inverse_h: 1 / h [1/m], float32.
         bend: power of the density's weight - 2: its gradient is u^(1 + bend), float32.
@@ -251,14 +189,13 @@ def geometry_of_pairs(pairs, columns, first, inverse_h, bend):
         (x, y, z) per largest gradient.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    rows = lanes_from(first, pairs.start.shape[0])
-    x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
+    x, y, z = take_points(positions, first, 0)
     w, n, square = spread(zero), spread(zero), spread(zero)
     tx, ty, tz = spread(zero), spread(zero), spread(zero)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
         j = load(pairs.neighbors, k)
-        dx, dy, dz = x - gather(xs, j), y - gather(ys, j), z - gather(zs, j)
+        dx, dy, dz = gather_points(positions, j)
+        dx, dy, dz = x - dx, y - dy, z - dz
         r2 = dx * dx + dy * dy + dz * dz + TINY
         inverse_r = inverse_root(r2)
         u = one - inverse_h * (r2 * inverse_r)

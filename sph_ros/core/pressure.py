@@ -12,9 +12,9 @@ from numba import prange
 
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK
-from sph_ros.core.pair_sums import divergence_of_pairs, pack, push_by_pairs
+from sph_ros.core.pair_sums import divergence_of_pairs, push_by_pairs
 from sph_ros.core.vector import LANES, larger, magnitude, spread, total, where
-from sph_ros.core.vector_memory import gather_column, lanes_from, put, take
+from sph_ros.core.vector_memory import lanes_from, put, take, take_points
 
 #: Fields of the state of an iteration, an array of float64; see `fresh_state`.
 ITERATION, SHARE, INERTIA, BEFORE, BEST, ENOUGH, ERROR, DONE, FIELDS = range(9)
@@ -80,23 +80,16 @@ def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
 
 
 @inlined
-def _displace(
-    first, pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
-):
+def _displace(first, pairs, pressures, contact_gradients, cohesive, displacements):
     """What `pressure_displacements` does, for the slice that begins at particle `first`."""
-    rows = lanes_from(first, pressures.shape[0])
     own, x, y, z = push_by_pairs(pairs, pressures, first)
-    x = gather_column(cohesive, rows, 0) - x - own * gather_column(contact_gradients, rows, 0)
-    y = gather_column(cohesive, rows, 1) - y - own * gather_column(contact_gradients, rows, 1)
-    z = gather_column(cohesive, rows, 2) - z - own * gather_column(contact_gradients, rows, 2)
-    put((x, y, z), displacements, first)
-    put(pack(x, y, z, support_radius), packed, first)
+    gx, gy, gz = take_points(contact_gradients, first, 0)
+    cx, cy, cz = take_points(cohesive, first, 0)
+    put((cx - x - own * gx, cy - y - own * gy, cz - z - own * gz), displacements, first)
 
 
 @parallel_kernel
-def pressure_displacements(
-    pairs, pressures, contact_gradients, cohesive, support_radius, displacements, packed
-):
+def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displacements):
     """Displacements by given pressures (Clavet 2005, Alg. 2, gathered).
 
     Each particle gathers from its neighbours. The two sides of a pair are the same numbers with
@@ -107,26 +100,19 @@ def pressure_displacements(
         pressures: times dt^2 / (rho0 virial) [m^2], (N,).
         contact_gradients: as in `pressure_diagonal`.
         cohesive: displacements to start from [m], (N, 3).
-        support_radius: h [m], float32.
         displacements: [m], (N, 3); written.
-        packed: the same by `pack`, (N,) int64; written.
     """
     for s in prange(pairs.stop.shape[0]):
-        _displace(
-            s * LANES, pairs, pressures, contact_gradients, cohesive, support_radius,
-            displacements, packed,
-        )  # fmt: skip
+        _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)
 
 
 @inlined
-def _density_change(first, pairs, contact_gradients, support_radius, displacements, packed):
+def _density_change(first, pairs, contact_gradients, displacements):
     """How much denser a slice gets [-]."""
-    rows = lanes_from(first, packed.shape[0])
-    change = divergence_of_pairs(pairs, packed, first, support_radius)
-    for axis in range(3):
-        wall = gather_column(contact_gradients, rows, axis)
-        change += wall * gather_column(displacements, rows, axis)
-    return change
+    change = divergence_of_pairs(pairs, displacements, first)
+    x, y, z = take_points(displacements, first, 0)
+    gx, gy, gz = take_points(contact_gradients, first, 0)
+    return change + gx * x + gy * y + gz * z
 
 
 @inlined
@@ -150,7 +136,6 @@ def iterate_pressures(
     densities,
     residuals,
     contact_gradients,
-    support_radius,
     cohesive,
     yielded,
     diagonal,
@@ -162,7 +147,6 @@ def iterate_pressures(
     guesses,
     first,
     displacements,
-    packed,
     errors,
 ):
     """Iterate until the density is held, and displace by the pressures found.
@@ -176,7 +160,6 @@ def iterate_pressures(
         residuals: their errors at the displacements by the first guess, free bodies and compliance
             left out [-], (N,); or (0,): to be found.
         contact_gradients: as in `pressure_diagonal`.
-        support_radius: h [m], float32.
         cohesive: displacements to start from [m], (N, 3).
         yielded: how much the density sinks because free bodies give way to the guesses [-], (N,).
         diagonal: from `pressure_diagonal`.
@@ -187,7 +170,7 @@ def iterate_pressures(
         pressures: scaled [m^2], (N,); a first guess, improved in place.
         guesses: the same, extrapolated, (N,); those that displacements are made by.
         first: the first guess, (N,).
-        displacements, packed: see `pressure_displacements`; those by `pressures` at the end.
+        displacements: [m], (N, 3); those by `pressures` at the end.
         errors: (chunks,) float64; scratch.
     """
     count = pressures.shape[0]
@@ -196,10 +179,7 @@ def iterate_pressures(
         known = state[ITERATION] == 0.0 and residuals.shape[0] == count
         if not known:
             for s in prange(pairs.stop.shape[0]):
-                _displace(
-                    s * LANES, pairs, guesses, contact_gradients, cohesive, support_radius,
-                    displacements, packed,
-                )  # fmt: skip
+                _displace(s * LANES, pairs, guesses, contact_gradients, cohesive, displacements)
         inertia = state[INERTIA]
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia * inertia))
         share, momentum = np.float32(state[SHARE]), np.float32((inertia - 1.0) / grown)
@@ -210,9 +190,7 @@ def iterate_pressures(
                     residual = take(residuals, row)
                 else:
                     residual = take(densities, row) - np.float32(1.0)
-                    residual += _density_change(
-                        row, pairs, contact_gradients, support_radius, displacements, packed
-                    )
+                    residual += _density_change(row, pairs, contact_gradients, displacements)
                 error += _correct(
                     row, residual, yielded, compliance, diagonal, share, momentum, pressures,
                     guesses,
@@ -239,7 +217,4 @@ def iterate_pressures(
         state[BEST] = min(state[BEST], error)
     if state[DONE] > 0.0:
         for s in prange(pairs.stop.shape[0]):
-            _displace(
-                s * LANES, pairs, pressures, contact_gradients, cohesive, support_radius,
-                displacements, packed,
-            )  # fmt: skip
+            _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)

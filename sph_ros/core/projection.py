@@ -27,7 +27,7 @@ from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.pair_sums import weights_after
 from sph_ros.core.vector import LANES, larger, smaller, spread, where
-from sph_ros.core.vector_memory import gather_column, lanes_from, put, take
+from sph_ros.core.vector_memory import gather_column, lanes_from, put, take, take_points
 
 #: Excess of density that may be taken back over several steps [-].
 MILD = np.float32(0.01)
@@ -106,9 +106,8 @@ def push(velocities, gravity, time_step, pulled, displacements):
 
 @parallel_kernel
 def density_targets(
-    columns,
+    positions,
     displacements,
-    packed,
     support_radius,
     power,
     density_scale,
@@ -127,8 +126,8 @@ def density_targets(
     at the given displacements and linear in w.
 
     Args:
-        columns: positions [m], as in `find_neighbors`.
-        displacements, packed: expected ones, from `pressure_displacements`.
+        positions: [m], (N, 3), those of the lists.
+        displacements: expected ones [m], (N, 3).
         support_radius: h [m], float32.
         power: of the density's weight, as in `sum_densities`.
         density_scale: 1 / lattice sum of the weight [-], float32.
@@ -149,18 +148,20 @@ def density_targets(
     gradients = contacts.gradients
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows, zero = lanes_from(first, count), spread(np.float32(0.0))
-        weights, linear = weights_after(pairs, columns, packed, first, support_radius, bend)
+        zero = spread(np.float32(0.0))
+        weights, linear = weights_after(
+            pairs, positions, displacements, first, support_radius, bend
+        )
         now = take(density, first)
         excess, mild = now - one, spread(MILD)
         back = share * smaller(excess, mild) + rest * larger(excess - mild, zero)
         wanted = where(excess > zero, back, excess)
-        wanted += density_scale * weights - (now - gather_column(walls, rows, 0))
+        wall = gather_column(walls, lanes_from(first, count), 0)
+        wanted += density_scale * weights - (now - wall)
         put(wanted - linear + one, targets, first)
-        for axis in range(3):
-            moved = gather_column(displacements, rows, axis)
-            wanted += gather_column(gradients, rows, axis) * moved
-        put(wanted, residuals, first)
+        x, y, z = take_points(displacements, first, 0)
+        gx, gy, gz = take_points(gradients, first, 0)
+        put(wanted + gx * x + gy * y + gz * z, residuals, first)
         for i in range(first, min(first + LANES, count)):
             for k in range(contacts.start[i], contacts.end[i]):
                 t = contacts.terms[k]

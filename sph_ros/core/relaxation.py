@@ -23,7 +23,7 @@ from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import STEPS, impulse_of_pairs
 from sph_ros.core.vector import LANES, spread
-from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, take
+from sph_ros.core.vector_memory import gather, load, put, take, take_points
 
 
 class Tension(NamedTuple):
@@ -79,10 +79,9 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
     cohesion, near = tension.cohesion, tension.near * tension.virial_ratio
     offset = cohesion + tension.near
     density, near_density = sums.density, sums.near_density
-    g, step, count = contact_gradients, weight_ratio / STEPS, density.shape[0]
+    step = weight_ratio / STEPS
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows = lanes_from(first, count)
         own = cohesion * take(density, first) - offset
         own_near = near * take(near_density, first)
         x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
@@ -95,14 +94,18 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
             y += c * load(pairs.y, k)
             z += c * load(pairs.z, k)
         unit, wall = -pairs.unit[0], tension.adhesion * own
-        x = unit * x - wall * gather_column(g, rows, 0) - own_near * gather_column(g, rows, 3)
-        y = unit * y - wall * gather_column(g, rows, 1) - own_near * gather_column(g, rows, 4)
-        z = unit * z - wall * gather_column(g, rows, 2) - own_near * gather_column(g, rows, 5)
+        gx, gy, gz = take_points(contact_gradients, first, 0)
+        nx, ny, nz = take_points(contact_gradients, first, 3)
+        x = unit * x - wall * gx - own_near * nx
+        y = unit * y - wall * gy - own_near * ny
+        z = unit * z - wall * gz - own_near * nz
         put((x, y, z), displacements, first)
 
 
 @parallel_kernel
-def viscous_impulses(pairs, columns, velocities, support_radius, linear, quadratic, most, changed):
+def viscous_impulses(
+    pairs, positions, velocities, support_radius, linear, quadratic, most, changed
+):
     """Velocities after the viscosity impulses (Clavet 2005, Alg. 5).
 
     The linear impulse acts on all pairs, not only on approaching ones: one-sided it would also
@@ -111,7 +114,7 @@ def viscous_impulses(pairs, columns, velocities, support_radius, linear, quadrat
 
     Args:
         pairs: from `find_neighbors`.
-        columns: coordinates [m], as there.
+        positions: [m], (N, 3), those of the lists.
         velocities: [m/s], (N, 3).
         support_radius: h [m], float32.
         linear: impulse per relative speed, time step included [-], float32.
@@ -119,36 +122,33 @@ def viscous_impulses(pairs, columns, velocities, support_radius, linear, quadrat
         most: share of the relative speed that a pair at zero distance may take [-], float32.
         changed: velocities afterwards [m/s], (N, 3); written.
     """
-    inverse_h, count = np.float32(1.0) / support_radius, velocities.shape[0]
+    inverse_h = np.float32(1.0) / support_radius
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
         x, y, z = impulse_of_pairs(
-            pairs, columns, velocities, first, inverse_h, linear, quadratic, most
+            pairs, positions, velocities, first, inverse_h, linear, quadratic, most
         )
-        rows = lanes_from(first, count)
-        x = gather_column(velocities, rows, 0) - x
-        y = gather_column(velocities, rows, 1) - y
-        z = gather_column(velocities, rows, 2) - z
-        put((x, y, z), changed, first)
+        vx, vy, vz = take_points(velocities, first, 0)
+        put((vx - x, vy - y, vz - z), changed, first)
 
 
 @parallel_kernel
-def viscous_operator(pairs, columns, velocities, support_radius, linear, result):
+def viscous_operator(pairs, positions, velocities, support_radius, linear, result):
     """Left side of implicit viscosity: v minus the linear impulses that v itself would cause.
 
     Symmetric and positive definite, for conjugate gradients; constants pass unchanged, so momentum
     is kept by every iteration.
 
     Args:
-        pairs, columns, velocities, support_radius, linear: as in `viscous_impulses`.
+        pairs, positions, velocities, support_radius, linear: as in `viscous_impulses`.
         result: [m/s], (N, 3); written.
     """
-    inverse_h, count = np.float32(1.0) / support_radius, velocities.shape[0]
+    inverse_h = np.float32(1.0) / support_radius
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
         x, y, z = impulse_of_pairs(
             pairs,
-            columns,
+            positions,
             velocities,
             first,
             inverse_h,
@@ -156,11 +156,8 @@ def viscous_operator(pairs, columns, velocities, support_radius, linear, result)
             np.float32(0.0),
             np.float32(np.inf),
         )
-        rows = lanes_from(first, count)
-        x = gather_column(velocities, rows, 0) + x
-        y = gather_column(velocities, rows, 1) + y
-        z = gather_column(velocities, rows, 2) + z
-        put((x, y, z), result, first)
+        vx, vy, vz = take_points(velocities, first, 0)
+        put((vx + x, vy + y, vz + z), result, first)
 
 
 @parallel_kernel

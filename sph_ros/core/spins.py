@@ -24,7 +24,7 @@ from numba import prange
 
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.vector import LANES, larger, smaller, spread
-from sph_ros.core.vector_memory import gather, gather_column, lanes_from, load, put, take
+from sph_ros.core.vector_memory import gather_points, load, put, take, take_points
 
 #: Determinant of M, relative to the lattice's, that stands for no neighbours at all [-].
 NOTHING = np.float32(1e-9)
@@ -46,17 +46,16 @@ def solved(matrix, least, x, y, z):
 
 
 @inlined
-def matrix_of_pairs(pairs, columns, first):
+def matrix_of_pairs(pairs, positions, first):
     """M of the particles of a slice [-]: xx, yy, zz, xy, xz, yz."""
     zero = np.float32(0.0)
     xx, yy, zz = spread(zero), spread(zero), spread(zero)
     xy, xz, yz = spread(zero), spread(zero), spread(zero)
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    rows = lanes_from(first, pairs.start.shape[0])
-    x, y, z = gather(xs, rows), gather(ys, rows), gather(zs, rows)
+    x, y, z = take_points(positions, first, 0)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
         j = load(pairs.neighbors, k)
-        dx, dy, dz = gather(xs, j) - x, gather(ys, j) - y, gather(zs, j) - z
+        dx, dy, dz = gather_points(positions, j)
+        dx, dy, dz = dx - x, dy - y, dz - z
         gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
         xx += gy * dy + gz * dz
         yy += gx * dx + gz * dz
@@ -73,15 +72,12 @@ def turning_of_pairs(pairs, velocities, first):
     """Sum of g_ij x (v_j - v_i) over the neighbours j of a slice, x, y, z [1/s]."""
     zero = np.float32(0.0)
     x, y, z = spread(zero), spread(zero), spread(zero)
-    rows = lanes_from(first, velocities.shape[0])
-    vx, vy = gather_column(velocities, rows, 0), gather_column(velocities, rows, 1)
-    vz = gather_column(velocities, rows, 2)
+    vx, vy, vz = take_points(velocities, first, 0)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
         j = load(pairs.neighbors, k)
         gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
-        a = gather_column(velocities, j, 0) - vx
-        b = gather_column(velocities, j, 1) - vy
-        c = gather_column(velocities, j, 2) - vz
+        a, b, c = gather_points(velocities, j)
+        a, b, c = a - vx, b - vy, c - vz
         x += gy * c - gz * b
         y += gz * a - gx * c
         z += gx * b - gy * a
@@ -92,7 +88,7 @@ def turning_of_pairs(pairs, velocities, first):
 @parallel_kernel
 def rub_spins(
     pairs,
-    columns,
+    positions,
     sums,
     velocities,
     determinant,
@@ -111,7 +107,7 @@ def rub_spins(
 
     Args:
         pairs, sums: from `sum_densities`.
-        columns: coordinates [m], as there.
+        positions: [m], (N, 3), those of the lists.
         velocities: [m/s], (N, 3).
         determinant: of M in the lattice [-], float32.
         square: sum of squared gradients in the lattice [1/m^2], float32.
@@ -122,25 +118,22 @@ def rub_spins(
         pushes: p_i times the step [m^2/s], (N, 3); written.
     """
     one = np.float32(1.0)
-    gradients, squares, count = sums.gradient, sums.gradient_square, spins.shape[0]
+    gradients, squares = sums.gradient, sums.gradient_square
     least = NOTHING * determinant
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows = lanes_from(first, count)
-        matrix = matrix_of_pairs(pairs, columns, first)
+        matrix = matrix_of_pairs(pairs, positions, first)
         x, y, z = turning_of_pairs(pairs, velocities, first)
         x, y, z, found = solved(matrix, least, x, y, z)
         known = smaller(found / determinant, spread(one))
-        gx, gy = gather_column(gradients, rows, 0), gather_column(gradients, rows, 1)
-        gz = gather_column(gradients, rows, 2)
+        gx, gy, gz = take_points(gradients, first, 0)
         uneven = (take(squares, first) + gx * gx + gy * gy + gz * gz) / square
         known *= known / larger(uneven * uneven, spread(one))
         if new:
             put((known * x, known * y, known * z), spins, first)
         strength = exchange * known
         share = strength / (square_radius + strength)
-        wx, wy = gather_column(spins, rows, 0), gather_column(spins, rows, 1)
-        wz = gather_column(spins, rows, 2)
+        wx, wy, wz = take_points(spins, first, 0)
         x, y, z = wx - x, wy - y, wz - z
         put((wx - share * x, wy - share * y, wz - share * z), spins, first)
         strength *= one - share
@@ -157,24 +150,19 @@ def push_by_spins(pairs, pushes, velocities):
         pushes: from `rub_spins` [m^2/s], (N, 3).
         velocities: [m/s], (N, 3); changed.
     """
-    zero, count = np.float32(0.0), velocities.shape[0]
+    zero = np.float32(0.0)
     for s in prange(pairs.stop.shape[0]):
         first = s * LANES
-        rows = lanes_from(first, count)
         x, y, z = spread(zero), spread(zero), spread(zero)
-        px, py = gather_column(pushes, rows, 0), gather_column(pushes, rows, 1)
-        pz = gather_column(pushes, rows, 2)
+        px, py, pz = take_points(pushes, first, 0)
         for k in range(pairs.start[first], pairs.stop[s], LANES):
             j = load(pairs.neighbors, k)
             gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
-            a = px + gather_column(pushes, j, 0)
-            b = py + gather_column(pushes, j, 1)
-            c = pz + gather_column(pushes, j, 2)
+            a, b, c = gather_points(pushes, j)
+            a, b, c = px + a, py + b, pz + c
             x += b * gz - c * gy
             y += c * gx - a * gz
             z += a * gy - b * gx
         unit = pairs.unit[0]
-        x = gather_column(velocities, rows, 0) - unit * x
-        y = gather_column(velocities, rows, 1) - unit * y
-        z = gather_column(velocities, rows, 2) - unit * z
-        put((x, y, z), velocities, first)
+        vx, vy, vz = take_points(velocities, first, 0)
+        put((vx - unit * x, vy - unit * y, vz - unit * z), velocities, first)

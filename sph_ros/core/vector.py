@@ -10,6 +10,7 @@ Here are the types and what is computed with them; `core.vector_memory` reads an
 """
 
 import operator
+from pathlib import Path
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -26,6 +27,26 @@ INTERPRETED = bool(config.DISABLE_JIT)
 
 #: Whether the processor has AVX-512: compressing stores, gathering, estimates of 1 / root.
 HAS_AVX512 = bool(llvm.get_host_cpu_features().get("avx512f", False))
+
+#: Where the kernel says what was done against a leak of data through gathers (Intel's Downfall).
+GATHER_LEAK = Path("/sys/devices/system/cpu/vulnerabilities/gather_data_sampling")
+
+
+def _gathers_quickly():
+    """Whether the processor's own gathers beat sixteen loads.
+
+    They do on Intel's with AVX-512, unless microcode slows them down against a leak. On AMD's Zen 4
+    and 5 they take up to a third longer.
+    """
+    try:
+        slowed = GATHER_LEAK.read_text(encoding="ascii").startswith("Mitigation")
+    except OSError:
+        slowed = False
+    return HAS_AVX512 and not slowed and not llvm.get_host_cpu_name().startswith("znver")
+
+
+#: Whether to gather by the processor's own instructions.
+GATHERS = _gathers_quickly()
 
 #: The same freedom as all other code has: see `core.jit`.
 FAST = ("reassoc", "contract", "nsz")

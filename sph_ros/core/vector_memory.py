@@ -3,6 +3,10 @@
 
 Arrays of particles have any number of rows; `take` and `put` are for the sixteen from some row on,
 as far as there are so many.
+
+Three numbers of a row are read at once (`gather_points`) and sixteen such readings transposed in
+registers, which takes a third of what three gathers take. Four numbers are read for that, so
+behind the last one of an array one more must be readable: see `sim.state.padded`.
 """
 
 import numpy as np
@@ -16,7 +20,7 @@ from sph_ros.core.vector import (
     BITS,
     FLOAT,
     FLOATS,
-    HAS_AVX512,
+    GATHERS,
     INT16,
     INT32,
     INT64,
@@ -24,7 +28,6 @@ from sph_ros.core.vector import (
     LANES,
     WHOLE,
     call_llvm,
-    constant,
     floats,
     splat,
     whole,
@@ -49,7 +52,7 @@ def gather_vector(builder, pointer, indices):
     """Elements of 4 bytes, floats or integers, as a vector; indices are read as signed."""
     element = pointer.type.pointee if hasattr(pointer.type, "pointee") else FLOAT
     vector = ir.VectorType(element, LANES)
-    if HAS_AVX512:
+    if GATHERS:
         kinds = [FLOATS, ir.IntType(8).as_pointer(), WHOLE, BITS, INT32]
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(FLOATS, kinds), "llvm.x86.avx512.mask.gather.dps.512"
@@ -134,54 +137,104 @@ def _gather_plainly(array, indices):
     return array[indices] if array.dtype == np.float32 else array[indices].astype(np.int32)
 
 
-@intrinsic
-def _gather_words_compiled(typingctx, array, indices):
-    def generate(context, builder, sig, args):
-        # Each word is two elements of 4 bytes.
-        place = data_pointer(context, builder, sig.args[0], args[0])
-        return context.make_tuple(builder, sig.return_type, _words(builder, place, args[1]))
-
-    return signature(types.UniTuple(whole, 2), array, whole), generate
+def _lanes(builder, first, count):
+    """first, first + 1, ..., but at most count - 1."""
+    start, last = (builder.trunc(value, INT32) for value in (first, count))
+    last = splat(builder, builder.sub(last, ir.Constant(INT32, 1)))
+    indices = builder.add(splat(builder, start), ir.Constant(WHOLE, list(range(LANES))))
+    return builder.select(builder.icmp_signed("<", indices, last), indices, last)
 
 
-def _words(builder, place, indices):
-    if not HAS_AVX512:
-        place = builder.bitcast(place, INT32.as_pointer())
-        double = builder.shl(indices, constant(1, WHOLE))
-        return [
-            gather_vector(builder, place, builder.or_(double, constant(half, WHOLE)))
-            for half in (0, 1)
-        ]
-    eight, bits = ir.VectorType(INT64, 8), ir.VectorType(ir.IntType(1), 8)
-    kinds = [eight, ir.IntType(8).as_pointer(), ir.VectorType(INT32, 8), bits, INT32]
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(eight, kinds), "llvm.x86.avx512.mask.gather.dpq.512"
-    )
-    place, pieces = builder.bitcast(place, kinds[1]), []
-    for first in (0, 8):
-        lanes = ir.Constant(kinds[2], list(range(first, first + 8)))
-        part = builder.shuffle_vector(indices, indices, lanes)
-        arguments = [ir.Constant(eight, None), place, part, ir.Constant(bits, [1] * 8)]
-        found = builder.call(function, [*arguments, ir.Constant(INT32, 8)])
-        pieces.append(builder.bitcast(found, WHOLE))
-    return [
-        builder.shuffle_vector(*pieces, ir.Constant(WHOLE, list(range(half, 2 * LANES, 2))))
-        for half in (0, 1)
+def _shuffled(builder, first, second, block):
+    """In each quarter of two vectors the lanes `block`, 0 to 3 of the first, 4 to 7 of the second.
+
+    These are the shuffles that processors have one instruction for.
+    """
+    lanes = [
+        4 * quarter + (lane if lane < 4 else LANES - 4 + lane)
+        for quarter in range(4)
+        for lane in block
     ]
+    return builder.shuffle_vector(first, second, ir.Constant(WHOLE, lanes))
 
 
-def _gather_words_plainly(array, indices):
-    halves = np.ascontiguousarray(array[indices]).view(np.int32).reshape(-1, 2)
-    return halves[:, 0], halves[:, 1]
+def _joined(builder, vectors):
+    """Vectors of the same length end to end, two, four, ... of them."""
+    while len(vectors) > 1:
+        count = 2 * vectors[0].type.count
+        lanes = ir.Constant(ir.VectorType(INT32, count), list(range(count)))
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [builder.shuffle_vector(low, high, lanes) for low, high in pairs]
+    return vectors[0]
+
+
+def _points(builder, place, offsets):
+    """Three floats from each of sixteen offsets on, as three vectors; four are read."""
+    four, rows = ir.VectorType(FLOAT, 4), []
+    for offset in offsets:
+        row = builder.bitcast(builder.gep(place, [offset]), four.as_pointer())
+        rows.append(builder.load(row))
+        rows[-1].align = 4
+    # Quarter q of vector k is row 4 q + k.
+    a, b, c, d = (_joined(builder, rows[k::4]) for k in range(4))
+    front = _shuffled(builder, a, b, (0, 4, 1, 5)), _shuffled(builder, c, d, (0, 4, 1, 5))
+    back = _shuffled(builder, a, b, (2, 6, 3, 7)), _shuffled(builder, c, d, (2, 6, 3, 7))
+    x, y = _shuffled(builder, *front, (0, 1, 4, 5)), _shuffled(builder, *front, (2, 3, 6, 7))
+    return x, y, _shuffled(builder, *back, (0, 1, 4, 5))
+
+
+@intrinsic
+def _gather_points_compiled(typingctx, array, indices):
+    def generate(context, builder, sig, args):
+        place, three = data_pointer(context, builder, sig.args[0], args[0]), ir.Constant(INT64, 3)
+        rows = (builder.sext(_lane(builder, args[1], lane), INT64) for lane in range(LANES))
+        points = _points(builder, place, [builder.mul(row, three) for row in rows])
+        return context.make_tuple(builder, sig.return_type, points)
+
+    return signature(types.UniTuple(floats, 3), array, whole), generate
+
+
+def _gather_points_plainly(array, indices):
+    return tuple(array[indices].T)
+
+
+@intrinsic
+def _take_points_compiled(typingctx, array, row, column):
+    def generate(context, builder, sig, args):
+        array_, row_, column_ = args
+        place = builder.gep(data_pointer(context, builder, sig.args[0], array_), [column_])
+        count, width = (_shape(context, builder, sig.args[0], array_, axis) for axis in (0, 1))
+        results = [cgutils.alloca_once(builder, FLOATS) for _ in range(3)]
+        rows = [builder.add(row_, ir.Constant(row_.type, lane)) for lane in range(LANES + 1)]
+        with builder.if_else(builder.icmp_signed("<", rows[-1], count), likely=True) as (
+            all_,
+            some,
+        ):
+            with all_:
+                offsets = [builder.mul(row, width) for row in rows[:-1]]
+                for vector, result in zip(_points(builder, place, offsets), results, strict=True):
+                    builder.store(vector, result)
+            with some:
+                indices = builder.mul(
+                    _lanes(builder, row_, count), splat(builder, builder.trunc(width, INT32))
+                )
+                for axis, result in enumerate(results):
+                    begin = builder.gep(place, [ir.Constant(INT64, axis)])
+                    builder.store(gather_vector(builder, begin, indices), result)
+        points = [builder.load(result) for result in results]
+        return context.make_tuple(builder, sig.return_type, points)
+
+    return signature(types.UniTuple(floats, 3), array, types.intp, types.intp), generate
+
+
+def _take_points_plainly(array, row, column):
+    return tuple(array[_lanes_plainly(row, len(array)), column : column + 3].T)
 
 
 @intrinsic
 def _lanes_compiled(typingctx, first, count):
     def generate(context, builder, sig, args):
-        start, last = (builder.trunc(value, INT32) for value in args)
-        last = splat(builder, builder.sub(last, ir.Constant(INT32, 1)))
-        indices = builder.add(splat(builder, start), ir.Constant(WHOLE, list(range(LANES))))
-        return builder.select(builder.icmp_signed("<", indices, last), indices, last)
+        return _lanes(builder, *args)
 
     return signature(whole, types.intp, types.intp), generate
 
@@ -203,11 +256,7 @@ def _take_compiled(typingctx, array, row):
             with all_rows:
                 builder.store(load_vector(builder, place, row_), result)
             with some:
-                last = builder.trunc(builder.sub(count, ir.Constant(count.type, 1)), INT32)
-                first = splat(builder, builder.trunc(row_, INT32))
-                indices = builder.add(first, ir.Constant(WHOLE, list(range(LANES))))
-                inside = builder.icmp_signed("<", indices, splat(builder, last))
-                indices = builder.select(inside, indices, splat(builder, last))
+                indices = _lanes(builder, row_, count)
                 builder.store(gather_vector(builder, place, indices), result)
         return builder.load(result)
 
@@ -268,10 +317,7 @@ def _put_compiled(typingctx, vectors, array, row):
 
 def _put_plainly(vectors, array, row):
     count = min(LANES, len(array) - row)
-    if array.dtype == np.int64:
-        low, high = (vector[:count].astype(np.int64) for vector in vectors)
-        array[row : row + count] = (high << 32) | (low & 0xFFFFFFFF)
-    elif array.ndim == 1:
+    if array.ndim == 1:
         array[row : row + count] = vectors[:count]
     else:
         array[row : row + count] = np.stack(vectors, axis=1)[:count]
@@ -283,14 +329,18 @@ load = _load_plainly if INTERPRETED else _load_compiled
 store = _store_plainly if INTERPRETED else _store_compiled
 #: gather(array, indices): elements of a contiguous array, from any places; float32, int32, uint32.
 gather = _gather_plainly if INTERPRETED else _gather_compiled
-#: gather_words(array, indices): elements of an int64 array as two vectors, lower and upper halves.
-gather_words = _gather_words_plainly if INTERPRETED else _gather_words_compiled
+#: gather_points(array, indices): rows of an (N, 3) float32 array, from any places, as x, y, z. One
+#: more float must be readable behind the array.
+gather_points = _gather_points_plainly if INTERPRETED else _gather_points_compiled
+#: take_points(array, row, column): the same of the rows from a row on, beyond the last one that
+#: again; of an (N, K) array the three elements from a column on.
+take_points = _take_points_plainly if INTERPRETED else _take_points_compiled
 #: lanes_from(first, count): first, first + 1, ..., but at most count - 1.
 lanes_from = _lanes_plainly if INTERPRETED else _lanes_compiled
 #: take(array, row): the elements of a (N,) array from a row on; beyond the last one that again.
 take = _take_plainly if INTERPRETED else _take_compiled
 #: put(vectors, array, row): write a vector to the rows from `row` on of a (N,) array; of (x, y, z)
-#: to an (N, 3) array; (low, high) to an (N,) int64 array. Only rows that there are.
+#: to an (N, 3) array. Only rows that there are.
 put = _put_plainly if INTERPRETED else _put_compiled
 
 

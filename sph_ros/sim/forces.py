@@ -130,7 +130,7 @@ class ForcesSolver(LeapfrogSolver):
         np.divide(np.float32(1.0), self.rest_densities(fluid), out=state.lightness)
         self._factors = packed(self._lattice_factors, self._packing)
         forces.sum_densities(
-            work.columns, fluid.velocities, self._h, self._factors, work.pairs, state
+            work.predicted, fluid.velocities, self._h, self._factors, work.pairs, state
         )
         if len(self._solids):
             forces.add_walls(fluid.velocities, work.contacts, state)

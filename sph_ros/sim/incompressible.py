@@ -234,9 +234,7 @@ class IncompressibleSolver(PressureSolver):
             work.scaled,
             work.contacts.gradients,
             work.cohesive,
-            self._h,
             work.starts,
-            work.packed,
         )
         work.starts *= np.float32(1.0 / time_step)
         fluid.velocities += work.starts
@@ -262,14 +260,11 @@ class IncompressibleSolver(PressureSolver):
             work.scaled,
             work.contacts.gradients,
             work.cohesive,
-            self._h,
             work.displacements,
-            work.packed,
         )
         project.density_targets(
-            work.columns,
+            work.predicted,
             work.displacements,
-            work.packed,
             self._h,
             np.float32(self._power),
             np.float32(self.scales.density_scale * self._packing),

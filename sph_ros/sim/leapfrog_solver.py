@@ -162,7 +162,7 @@ class LeapfrogSolver(Solver):
         h, s, d = self._scene.support_radius, self._scene.spacing, self._scene.dimension
         scales = [np.float32(1.0 / lattice_sum(power, h, s, d)) for power in POWERS]
         search.sum_densities(
-            work.columns,
+            work.predicted,
             self._h,
             np.float32(DENSITY_POWER),
             *scales,

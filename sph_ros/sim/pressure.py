@@ -67,7 +67,6 @@ def solve_pressures(
     work,
     densities,
     gradients,
-    support_radius,
     compliance,
     goal,
     share,
@@ -82,7 +81,6 @@ def solve_pressures(
             and a first guess by `scale_guess`; `scaled` and `displacements` are written.
         densities: without displacement, relative to rest [-], (N,).
         gradients: of the contacts, (N, 6).
-        support_radius: h [m], float32.
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.
         share, most_share: of the Jacobi correction to take now, and when all is well.
@@ -103,7 +101,6 @@ def solve_pressures(
             densities,
             residuals,
             gradients,
-            support_radius,
             work.cohesive,
             work.yielded,
             work.diagonal,
@@ -115,7 +112,6 @@ def solve_pressures(
             work.guesses,
             work.first,
             work.displacements,
-            work.packed,
             work.errors,
         )
     share = min(GROW * float(state[core.SHARE]), most_share)

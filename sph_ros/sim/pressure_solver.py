@@ -98,7 +98,7 @@ class PressureSolver(Solver):
     def _sum_densities(self):
         work = self._work
         search.sum_densities(
-            work.columns,
+            work.predicted,
             self._h,
             np.float32(self._power),
             np.float32(self.scales.density_scale * self._packing),
@@ -168,7 +168,6 @@ class PressureSolver(Solver):
             work,
             densities,
             gradients,
-            self._h,
             compliance,
             goal,
             self._share,

@@ -66,7 +66,7 @@ def turn_liquid(fluid, work, scene, power, density_scale, radius, steps):
     exchange = 4.0 * STRENGTH * scene.spacing**2 * min(steps, 1.0)
     core.rub_spins(
         work.pairs,
-        work.columns,
+        work.predicted,
         work.sums,
         fluid.velocities,
         np.float32(determinant * density_scale**3),

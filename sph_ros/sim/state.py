@@ -60,11 +60,9 @@ class Fluid:
         """Start with particles in public order."""
         count = len(positions)
         self.capacity = max(capacity, count)
-        self._store = {
-            name: np.zeros((self.capacity, columns) if columns else self.capacity, kind)
-            for name, (columns, kind) in self.ROWS.items()
-        }
-        self._spare = {name: np.zeros_like(rows) for name, rows in self._store.items()}
+        self._store, self._spare = (
+            {name: padded(self.capacity, *row) for name, row in self.ROWS.items()} for _ in range(2)
+        )
         self._store["ids"] = np.zeros(self.capacity, np.uint32)
         self._resize(count)
         self.positions[:] = np.reshape(positions, (count, 3))
@@ -184,7 +182,6 @@ class Workspace:
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses, first, targets, residuals, yielded: of the pressure iterations,
             (N,) float32.
-        packed: displacements once more, (N,) int64.
         masses: of the particles where they differ [kg]; scales: times a factor, (N,) float32.
         errors, strongest: (chunks,) float64; squeezed: (chunks,) int64.
         totals: (chunks, 3) float64.
@@ -208,7 +205,6 @@ class Workspace:
         "targets": (0, np.float32),
         "residuals": (0, np.float32),
         "yielded": (0, np.float32),
-        "packed": (0, np.int64),
         "masses": (0, np.float32),
         "scales": (0, np.float32),
     }
@@ -225,10 +221,7 @@ class Workspace:
         self.capacity = capacity
         self.slots = solids if slots is None else slots
         chunks = max(chunk_count(capacity), 1)
-        self._store = {
-            name: np.zeros((capacity, columns) if columns else capacity, kind)
-            for name, (columns, kind) in self.ROWS.items()
-        }
+        self._store = {name: padded(capacity, *row) for name, row in self.ROWS.items()}
         self._chunk_store = {
             "errors": np.zeros(chunks, np.float64),
             "strongest": np.zeros(chunks, np.float64),
@@ -240,7 +233,7 @@ class Workspace:
         self._sums = Sums(
             np.ones(capacity, np.float32),
             np.ones(capacity, np.float32),
-            np.empty((capacity, 3), np.float32),
+            padded(capacity, 3),
             np.empty(capacity, np.float32),
         )
         room = chunks * CHUNK * self.slots
@@ -250,7 +243,7 @@ class Workspace:
             np.empty(room, np.int32),
             np.empty((room, TERMS), np.float32),
             np.zeros((capacity, 2), np.float32),
-            np.zeros((capacity, 6), np.float32),
+            padded(capacity, 6),
         )
         self._allocate_pairs(pairs_per_particle)
         self.fit(capacity)
@@ -296,6 +289,14 @@ class Workspace:
 
 #: Fields of `Contacts` with a row per particle.
 _PER_PARTICLE = ("start", "end", "density", "gradients")
+
+
+def padded(count, columns, kind=np.float32):
+    """Rows of zeros, numbers where `columns` is 0, behind which there is room for one more.
+
+    `core.vector_memory.gather_points` may read beyond the last row.
+    """
+    return np.zeros((count + 1, columns) if columns else count + 1, kind)[:count]
 
 
 def aligned(count, kind):

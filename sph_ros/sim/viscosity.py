@@ -59,7 +59,7 @@ def apply_viscosity(work, fluid, rates, motion):
     if rates.quadratic > 0.0 or (rates.linear > 0.0 and not implicit):
         relax.viscous_impulses(
             work.pairs,
-            work.columns,
+            work.predicted,
             fluid.velocities,
             np.float32(rates.support_radius),
             np.float32(0.0 if implicit else rates.linear),
@@ -105,7 +105,7 @@ def _solve_implicitly(work, velocities, rates, touching):
         return float(work.errors.sum())
 
     def apply(v, moving):
-        relax.viscous_operator(work.pairs, work.columns, v, reach, linear, image)
+        relax.viscous_operator(work.pairs, work.predicted, v, reach, linear, image)
         if touching:
             add_drag(work.contacts, wall, np.float32(moving), v, image)
 
