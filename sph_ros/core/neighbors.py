@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cell-sorted particles and their neighbour lists.
 
-Particles are sorted by cell (cells of one support radius, x fastest), so the candidates of a
-particle are nine contiguous runs (three in 2D). A list and the geometry of each pair are made once
-a step and read by every pass of the solver. A particle is its own neighbour: its gradient with
+Particles are sorted by cell (cells of one support radius), so the candidates of a particle are nine
+contiguous runs (three in 2D). The axis along which the liquid is longest changes slowest: neighbours
+are then as near as can be in memory, and the nearest cache holds a particle's. A list and the
+geometry of each pair are made once a step and read by every pass of the solver. A particle is its own neighbour: its gradient with
 itself is zero and its weight is the self term of the density, so no pass has to make an exception.
 """
 
@@ -40,12 +41,14 @@ class Grid(NamedTuple):
     """Cells over the particles.
 
     Attributes:
-        lower: corner of the first cell [m], (3,) float32.
+        axes: in the order of the cells, the one that changes fastest first, (3,) int32.
+        lower: corner of the first cell along these axes [m], (3,) float32.
         inverse_cell: 1 / cell size [1/m], float32.
-        counts: cells along x, y, z, (3,) int32.
+        counts: cells along these axes, (3,) int32.
         cell_start: first particle of each cell in the sorted order, (cells + 1,) int32.
     """
 
+    axes: np.ndarray
     lower: np.ndarray
     inverse_cell: np.float32
     counts: np.ndarray
@@ -111,22 +114,23 @@ def sort_by_cell(positions, grid, cell_of, order):
             written.
     """
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
+    a, b, c = grid.axes[0], grid.axes[1], grid.axes[2]
     cell_start, count = grid.cell_start, positions.shape[0]
     cells = nx * ny * nz
-    for c in range(cells):
-        cell_start[c] = 0
+    for cell in range(cells):
+        cell_start[cell] = 0
     for i in range(count):
-        cx = cell_coordinate(positions[i, 0], grid.lower[0], grid.inverse_cell, nx)
-        cy = cell_coordinate(positions[i, 1], grid.lower[1], grid.inverse_cell, ny)
-        cz = cell_coordinate(positions[i, 2], grid.lower[2], grid.inverse_cell, nz)
+        cx = cell_coordinate(positions[i, a], grid.lower[0], grid.inverse_cell, nx)
+        cy = cell_coordinate(positions[i, b], grid.lower[1], grid.inverse_cell, ny)
+        cz = cell_coordinate(positions[i, c], grid.lower[2], grid.inverse_cell, nz)
         cell = (cz * ny + cy) * nx + cx
         cell_of[i] = cell
         cell_start[cell] += 1
     # First the end of each cell, which then moves down to its start.
     end = 0
-    for c in range(cells):
-        end += cell_start[c]
-        cell_start[c] = end
+    for cell in range(cells):
+        end += cell_start[cell]
+        cell_start[cell] = end
     cell_start[cells] = count
     for i in range(count - 1, -1, -1):
         cell = cell_of[i]
@@ -137,7 +141,7 @@ def sort_by_cell(positions, grid, cell_of, order):
 @inlined
 def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
     """Append the neighbours of particle i; the new cursor, or -1 where there is no room."""
-    xs, ys, zs = columns[0], columns[1], columns[2]
+    xs, ys, zs = columns[grid.axes[0]], columns[grid.axes[1]], columns[grid.axes[2]]
     x, y, z = xs[i], ys[i], zs[i]
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
     cx = cell_coordinate(x, grid.lower[0], grid.inverse_cell, nx)

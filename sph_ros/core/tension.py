@@ -80,8 +80,10 @@ class Pulls(NamedTuple):
 def nearby_run(grid, x, y, z, run):
     """First and last particle + 1 of one of the 25 runs of cells around a place; (0, 0): outside.
 
-    A run is the cells along x, within reach, at one of the places across.
+    A run is the cells along the fastest axis, within reach, at one of the places across.
     """
+    place = (x, y, z)
+    x, y, z = place[grid.axes[0]], place[grid.axes[1]], place[grid.axes[2]]
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
     width = 2 * CELLS + 1
     ky = cell_coordinate(y, grid.lower[1], grid.inverse_cell, ny) + run % width - CELLS

@@ -33,6 +33,15 @@ def to_matrix(quat_xyzw):
     )
 
 
+def rotated_back(vectors, quat_xyzw):
+    """Vectors (N, 3) by the inverse rotation.
+
+    Not by a product of matrices: after one, threads of OpenBLAS that were there before this package
+    was loaded spin for milliseconds on the processors that the next step wants.
+    """
+    return np.einsum("ij,jk->ik", vectors, to_matrix(quat_xyzw))
+
+
 def multiply(a_xyzw, b_xyzw):
     """The rotation b followed by a."""
     ax, ay, az, aw = a_xyzw

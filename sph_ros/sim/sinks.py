@@ -7,7 +7,7 @@ import numpy as np
 
 from sph_ros.core.distances import signed_distances
 from sph_ros.core.rows import farthest_coordinates
-from sph_ros.sim.quaternions import to_matrix
+from sph_ros.sim.quaternions import rotated_back
 from sph_ros.sim.shapes import pack_shapes
 
 #: A particle so far from the scene is lost: it falls for ever, and the step shrinks with its speed.
@@ -75,7 +75,7 @@ class Sinks:
 
     def _distances(self, index, positions):
         pose = self._sinks[index].pose
-        local = (positions - np.float32(pose.position)) @ to_matrix(pose.quat_xyzw)
+        local = rotated_back(positions - np.float32(pose.position), pose.quat_xyzw)
         distance = np.empty(len(local), np.float32)
         signed_distances(self._packed, index, np.ascontiguousarray(local, np.float32), distance)
         return distance

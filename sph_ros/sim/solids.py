@@ -151,7 +151,7 @@ class Solid:
             [m], (M,) float32.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        local = (points - self.position) @ quaternions.to_matrix(self.quat_xyzw)
+        local = quaternions.rotated_back(points - self.position, self.quat_xyzw)
         local = np.ascontiguousarray(local, dtype=np.float32)
         distance = np.empty(len(local), np.float32)
         sheet = self._sheets.sheet_of[self._index]

@@ -319,9 +319,13 @@ def make_grid(lower, upper, cell, count):
     while int(np.prod(counts)) > limit:
         axis = int(np.argmax(counts))
         counts[axis] = max(counts[axis] // 2, 1)
+    # Runs of candidates lie along the second longest axis, and not along the shortest, so that few
+    # of them end early.
+    axes = np.argsort(extent, kind="stable")[[1, 0, 2]].astype(np.int32)
     return Grid(
-        np.asarray(lower, np.float32).copy(),
+        axes,
+        np.asarray(lower, np.float32)[axes],
         np.float32(1.0 / cell),
-        counts.astype(np.int32),
+        counts[axes].astype(np.int32),
         np.zeros(int(np.prod(counts)) + 1, np.int32),
     )
