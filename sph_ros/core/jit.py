@@ -11,6 +11,7 @@ differently and the result would depend on how the loop was split among threads.
 import hashlib
 import os
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 # A thread that waits for the others spins for some microseconds, then sleeps. Sleeping at once
@@ -20,7 +21,7 @@ from pathlib import Path
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
-from numba import config, njit  # noqa: E402
+from numba import config, get_num_threads, njit, set_num_threads  # noqa: E402
 
 FASTMATH = {"reassoc", "contract", "nsz"}
 
@@ -64,6 +65,23 @@ def _compiler(**options):
             config.CACHE_DIR = before
 
     return decorate
+
+
+@contextmanager
+def one_thread():
+    """Kernels called within run on the calling thread alone.
+
+    Each thread that calls parallel kernels gets helpers of its own, which then live as long as it
+    does. Once there are more helpers in a process than processors, libgomp's threads no longer spin
+    but sleep when they wait for each other, and steps take a quarter longer. So only one thread of
+    a process should have any.
+    """
+    before = get_num_threads()
+    set_num_threads(1)
+    try:
+        yield
+    finally:
+        set_num_threads(before)
 
 
 #: Folder of the compiled kernels of these sources in this place.

@@ -2,10 +2,11 @@
 """Cell-sorted particles and their neighbour lists.
 
 Particles are sorted by cell (cells of one support radius), so the candidates of a particle are nine
-contiguous runs (three in 2D). The axis along which the liquid is longest changes slowest: neighbours
-are then as near as can be in memory, and the nearest cache holds a particle's. A list and the
-geometry of each pair are made once a step and read by every pass of the solver. A particle is its own neighbour: its gradient with
-itself is zero and its weight is the self term of the density, so no pass has to make an exception.
+contiguous runs (three in 2D). The axis along which the liquid is longest changes slowest: then
+neighbours are as near in memory as can be, mostly in the nearest cache. A list and the geometry of
+each pair are made once a step and read by every pass of the solver. A particle is its own
+neighbour: its gradient with itself is zero and its weight is the self term of the density, so no
+pass has to make an exception.
 """
 
 from typing import NamedTuple

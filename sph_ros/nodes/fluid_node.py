@@ -10,6 +10,7 @@ whatever comes then (a bag that loops, a simulator that was reset) is another ru
 """
 
 import sys
+from contextlib import nullcontext
 from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -23,6 +24,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from sph_ros.core.jit import one_thread
 from sph_ros.nodes.diagnostics import (
     SLOW,
     Speedometer,
@@ -75,7 +77,9 @@ class FluidNode(Node):
     def _set_up(self):
         self._settings = Settings(self)
         scene_name, self._step_mode = self._settings.declare_first()
-        with tell_while_waiting(self._tell):
+        # The thread that steps gets helpers; this one needs none.
+        helpers = nullcontext() if self._step_mode == "lockstep" else one_thread()
+        with tell_while_waiting(self._tell), helpers:
             scene = load_scene(scene_name)
             self._settings.declare_live(scene.material, self._step_mode)
             self._runner = Runner(scene, self._settings.material())
