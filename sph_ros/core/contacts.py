@@ -8,6 +8,7 @@ rule of `walls`: the liquid's share of the support is the product of what each s
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK, PARTS, fresh_turns, next_chunk
 from sph_ros.core.contact_data import (
     DISTANCE,
     FRACTION,
@@ -27,7 +28,6 @@ from sph_ros.core.contact_data import (
 )
 from sph_ros.core.distances import normal_called, signed_distance
 from sph_ros.core.jit import called, inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.sheet_contacts import add_sheet_contacts
 from sph_ros.core.thin_films import add_film_walls, add_films
 from sph_ros.core.walls import wall_terms
@@ -158,19 +158,23 @@ def find_contacts(
         slots: most contacts of a particle, S and two for each sheet.
         contacts: all written; needs room for chunks * CHUNK * slots contacts.
     """
-    for turn in prange(turns(chunks)):
-        find_contacts_of_chunk(
-            chunk_of_turn(turn, chunks),
-            positions,
-            clearance,
-            shapes,
-            sheets,
-            motion,
-            inverse_step,
-            packing,
-            slots,
-            contacts,
-        )
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            find_contacts_of_chunk(
+                chunk,
+                positions,
+                clearance,
+                shapes,
+                sheets,
+                motion,
+                inverse_step,
+                packing,
+                slots,
+                contacts,
+            )
+            chunk = next_chunk(turns, part, chunks)
 
 
 @parallel_kernel
@@ -186,28 +190,31 @@ def pressure_reactions(positions, contacts, motion, sums, pressures, tension, sc
         reactions: force [N] and torque [N m] per chunk and solid, (chunks, S, 6) float64; added to.
     """
     count, chunks = positions.shape[0], reactions.shape[0]
-    for turn in prange(turns(chunks)):
-        chunk = chunk_of_turn(turn, chunks)
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            if contacts.start[i] == contacts.end[i]:
-                continue
-            pull = tension.cohesion * (sums.density[i] - np.float32(1.0)) - tension.near
-            push = (pressures[i] + tension.adhesion * pull) * scale
-            near_push = tension.near * tension.virial_ratio * sums.near_density[i] * scale
-            for k in range(contacts.start[i], contacts.end[i]):
-                t = contacts.terms[k]
-                add_reaction(
-                    reactions,
-                    chunk,
-                    contacts.solid[k],
-                    motion,
-                    positions[i, 0],
-                    positions[i, 1],
-                    positions[i, 2],
-                    push * t[GRADIENT] + near_push * t[NEAR_GRADIENT],
-                    push * t[GRADIENT + 1] + near_push * t[NEAR_GRADIENT + 1],
-                    push * t[GRADIENT + 2] + near_push * t[NEAR_GRADIENT + 2],
-                )
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+                if contacts.start[i] == contacts.end[i]:
+                    continue
+                pull = tension.cohesion * (sums.density[i] - np.float32(1.0)) - tension.near
+                push = (pressures[i] + tension.adhesion * pull) * scale
+                near_push = tension.near * tension.virial_ratio * sums.near_density[i] * scale
+                for k in range(contacts.start[i], contacts.end[i]):
+                    t = contacts.terms[k]
+                    add_reaction(
+                        reactions,
+                        chunk,
+                        contacts.solid[k],
+                        motion,
+                        positions[i, 0],
+                        positions[i, 1],
+                        positions[i, 2],
+                        push * t[GRADIENT] + near_push * t[NEAR_GRADIENT],
+                        push * t[GRADIENT + 1] + near_push * t[NEAR_GRADIENT + 1],
+                        push * t[GRADIENT + 2] + near_push * t[NEAR_GRADIENT + 2],
+                    )
+            chunk = next_chunk(turns, part, chunks)
 
 
 @parallel_kernel
@@ -226,36 +233,39 @@ def rub_on_solids(positions, contacts, motion, rate, drag, scale, velocities, re
         reactions: as in `pressure_reactions`; added to.
     """
     count, chunks = positions.shape[0], reactions.shape[0]
-    for turn in prange(turns(chunks)):
-        chunk = chunk_of_turn(turn, chunks)
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            for k in range(contacts.start[i], contacts.end[i]):
-                t = contacts.terms[k]
-                sx = velocities[i, 0] - t[SURFACE_VELOCITY]
-                sy = velocities[i, 1] - t[SURFACE_VELOCITY + 1]
-                sz = velocities[i, 2] - t[SURFACE_VELOCITY + 2]
-                along = sx * t[NORMAL] + sy * t[NORMAL + 1] + sz * t[NORMAL + 2]
-                sx -= along * t[NORMAL]
-                sy -= along * t[NORMAL + 1]
-                sz -= along * t[NORMAL + 2]
-                speed = np.sqrt(sx * sx + sy * sy + sz * sz)
-                wanted = (rate + drag * speed) * t[FRACTION]
-                share = wanted / (np.float32(1.0) + wanted)
-                velocities[i, 0] -= share * sx
-                velocities[i, 1] -= share * sy
-                velocities[i, 2] -= share * sz
-                add_reaction(
-                    reactions,
-                    chunk,
-                    contacts.solid[k],
-                    motion,
-                    positions[i, 0],
-                    positions[i, 1],
-                    positions[i, 2],
-                    scale[i] * share * sx,
-                    scale[i] * share * sy,
-                    scale[i] * share * sz,
-                )
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+                for k in range(contacts.start[i], contacts.end[i]):
+                    t = contacts.terms[k]
+                    sx = velocities[i, 0] - t[SURFACE_VELOCITY]
+                    sy = velocities[i, 1] - t[SURFACE_VELOCITY + 1]
+                    sz = velocities[i, 2] - t[SURFACE_VELOCITY + 2]
+                    along = sx * t[NORMAL] + sy * t[NORMAL + 1] + sz * t[NORMAL + 2]
+                    sx -= along * t[NORMAL]
+                    sy -= along * t[NORMAL + 1]
+                    sz -= along * t[NORMAL + 2]
+                    speed = np.sqrt(sx * sx + sy * sy + sz * sz)
+                    wanted = (rate + drag * speed) * t[FRACTION]
+                    share = wanted / (np.float32(1.0) + wanted)
+                    velocities[i, 0] -= share * sx
+                    velocities[i, 1] -= share * sy
+                    velocities[i, 2] -= share * sz
+                    add_reaction(
+                        reactions,
+                        chunk,
+                        contacts.solid[k],
+                        motion,
+                        positions[i, 0],
+                        positions[i, 1],
+                        positions[i, 2],
+                        scale[i] * share * sx,
+                        scale[i] * share * sy,
+                        scale[i] * share * sz,
+                    )
+            chunk = next_chunk(turns, part, chunks)
 
 
 @called
@@ -476,22 +486,23 @@ def keep_outside(
         squeezed: particles per chunk that had no way out but a rescue, (chunks,) int64; added to.
     """
     chunks = reactions.shape[0]
-    for turn in prange(turns(chunks)):
-        chunk = chunk_of_turn(turn, chunks)
-        if chunk >= chunks:
-            continue
-        squeezed[chunk] += keep_chunk_outside(
-            chunk,
-            starts,
-            ends,
-            origins,
-            clearance,
-            travel,
-            shapes,
-            motion,
-            margin,
-            spacing,
-            planar,
-            scale,
-            reactions,
-        )
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            squeezed[chunk] += keep_chunk_outside(
+                chunk,
+                starts,
+                ends,
+                origins,
+                clearance,
+                travel,
+                shapes,
+                motion,
+                margin,
+                spacing,
+                planar,
+                scale,
+                reactions,
+            )
+            chunk = next_chunk(turns, part, chunks)

@@ -9,9 +9,9 @@ layers.
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contacts import FRACTION, NORMAL, SURFACE_VELOCITY, add_reaction
 from sph_ros.core.jit import inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 
 
 @inlined

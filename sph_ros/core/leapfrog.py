@@ -8,8 +8,8 @@ kick in two halves gives positions and velocities of the same moment (velocity V
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK
 from sph_ros.core.jit import parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 
 
 @parallel_kernel

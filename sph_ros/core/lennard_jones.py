@@ -10,9 +10,9 @@ of the attraction is left between them.
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contacts import GRADIENT, add_reaction
 from sph_ros.core.jit import parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.vector import LANES
 
 #: Pairs do not repel harder than at this distance, in a: a pair that starts closer must not fly

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
 from sph_ros.core.near_points import append_within
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
@@ -29,13 +30,6 @@ from sph_ros.core.vector_memory import (
     take,
     take_points,
 )
-
-#: Particles handled by one piece of parallel work, whole slices; fixed, so that no sum depends on
-#: the threads.
-CHUNK = 256
-
-#: Stride of the chunks where solids make some of them dear.
-MIXED = 8
 
 
 class Grid(NamedTuple):
@@ -69,28 +63,6 @@ class Sums(NamedTuple):
     near_density: np.ndarray
     gradient: np.ndarray
     gradient_square: np.ndarray
-
-
-def chunk_count(particle_count):
-    """Pieces of parallel work for so many particles."""
-    return -(-particle_count // CHUNK)
-
-
-@inlined
-def turns(chunks):
-    """How many numbers `chunk_of_turn` has to be asked for."""
-    return MIXED * ((chunks + MIXED - 1) // MIXED)
-
-
-@inlined
-def chunk_of_turn(turn, chunks):
-    """Which chunk comes at a turn; `chunks` and more: none.
-
-    Chunks follow each other upwards, and threads take theirs in one piece. So that not one of them
-    gets all that lies on the floor, they come in strides.
-    """
-    rows = (chunks + MIXED - 1) // MIXED
-    return np.int64((turn % rows) * MIXED + turn // rows)
 
 
 @device
@@ -209,26 +181,32 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     count = pairs.start.shape[0]
     room = pairs.neighbors.shape[0] // chunks
     square = support_radius * support_radius
-    full = 0
     starts, ends = pairs.start, pairs.end
-    for chunk in prange(chunks):
-        staged = np.empty(room // 4 + LANES, np.uint32)
-        cursor, limit = np.intp(chunk * room), np.intp((chunk + 1) * room)
-        for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
-            place, width = np.intp(0), np.intp(0)
-            for i in range(first, min(first + LANES, count)):
-                begin = place
-                place = append_neighbors(i, columns, grid, square, staged, place, staged.shape[0])
-                if place < 0:
+    turns = fresh_turns()
+    full = np.zeros(PARTS, np.int64)
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            staged = np.empty(room // 4 + LANES, np.uint32)
+            cursor, limit = np.intp(chunk * room), np.intp((chunk + 1) * room)
+            for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
+                place, width = np.intp(0), np.intp(0)
+                for i in range(first, min(first + LANES, count)):
+                    begin = place
+                    place = append_neighbors(
+                        i, columns, grid, square, staged, place, staged.shape[0]
+                    )
+                    if place < 0:
+                        break
+                    starts[i], ends[i] = begin, place
+                    width = max(width, place - begin)
+                if place < 0 or cursor + width * LANES > limit:
+                    full[part] += 1
                     break
-                starts[i], ends[i] = begin, place
-                width = max(width, place - begin)
-            if place < 0 or cursor + width * LANES > limit:
-                full += 1
-                break
-            store_slice(first, staged, pairs, cursor, width)
-            cursor += width * LANES
-    return full
+                store_slice(first, staged, pairs, cursor, width)
+                cursor += width * LANES
+            chunk = next_chunk(turns, part, chunks)
+    return full.sum()
 
 
 @parallel_kernel
@@ -254,14 +232,18 @@ def sum_densities(
     gradient, gradient_square = sums.gradient, sums.gradient_square
     count = pairs.start.shape[0]
     pairs.unit[0] = slope / STEPS
-    for chunk in prange(chunks):
-        for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
-            w, n, square, x, y, z = geometry_of_pairs(pairs, positions, first, inverse_h, bend)
-            rows = lanes_from(first, count)
-            put(density_scale * w + gather_column(wall_density, rows, 0), density, first)
-            put(near_scale * n + gather_column(wall_density, rows, 1), near_density, first)
-            put((slope * x, slope * y, slope * z), gradient, first)
-            put((slope * slope) * square, gradient_square, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
+                w, n, square, x, y, z = geometry_of_pairs(pairs, positions, first, inverse_h, bend)
+                rows = lanes_from(first, count)
+                put(density_scale * w + gather_column(wall_density, rows, 0), density, first)
+                put(near_scale * n + gather_column(wall_density, rows, 1), near_density, first)
+                put((slope * x, slope * y, slope * z), gradient, first)
+                put((slope * slope) * square, gradient_square, first)
+            chunk = next_chunk(turns, part, chunks)
 
 
 @parallel_kernel
@@ -290,21 +272,26 @@ def densities_of_pairs(
     inverse_h = np.float32(1.0) / support_radius
     zero, one = np.float32(0.0), np.float32(1.0)
     count = density.shape[0]
-    for s in prange((count + LANES - 1) // LANES):
-        first = s * LANES
-        rows = lanes_from(first, count)
-        x, y, z = take_points(positions, first, 0)
-        weights = spread(zero)
-        for k in range(pairs.start[first], pairs.stop[s], LANES):
-            j = load(pairs.neighbors, k)
-            dx, dy, dz = gather_points(positions, j)
-            dx, dy, dz = x - dx, y - dy, z - dz
-            r2 = dx * dx + dy * dy + dz * dz + TINY
-            u = larger(one - inverse_h * (r2 * inverse_root(r2)), spread(zero))
-            weights += u * u
-        gx, gy, gz = take_points(wall_gradients, first, 0)
-        lx, ly, lz = take_points(listed, first, 0)
-        wall = gather_column(wall_density, rows, 0)
-        wall += gx * (x - lx) + gy * (y - ly) + gz * (z - lz)
-        weights = density_scale * (weights - filling_of(pairs, first))
-        put(weights + larger(wall, spread(zero)), density, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(count))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                rows = lanes_from(first, count)
+                x, y, z = take_points(positions, first, 0)
+                weights = spread(zero)
+                for k in range(pairs.start[first], pairs.stop[s], LANES):
+                    j = load(pairs.neighbors, k)
+                    dx, dy, dz = gather_points(positions, j)
+                    dx, dy, dz = x - dx, y - dy, z - dz
+                    r2 = dx * dx + dy * dy + dz * dz + TINY
+                    u = larger(one - inverse_h * (r2 * inverse_root(r2)), spread(zero))
+                    weights += u * u
+                gx, gy, gz = take_points(wall_gradients, first, 0)
+                lx, ly, lz = take_points(listed, first, 0)
+                wall = gather_column(wall_density, rows, 0)
+                wall += gx * (x - lx) + gy * (y - ly) + gz * (z - lz)
+                weights = density_scale * (weights - filling_of(pairs, first))
+                put(weights + larger(wall, spread(zero)), density, first)
+            chunk = next_chunk(turns, part, chunk_count(count))

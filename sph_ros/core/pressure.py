@@ -10,8 +10,8 @@ two being an equality. Both sums are the gradient of a convex function of p.
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.jit import inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import divergence_of_pairs, push_by_pairs
 from sph_ros.core.vector import LANES, larger, magnitude, spread, total, where
 from sph_ros.core.vector_memory import lanes_from, put, take, take_points
@@ -102,8 +102,13 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
         cohesive: displacements to start from [m], (N, 3).
         displacements: [m], (N, 3); written.
     """
-    for s in prange(pairs.stop.shape[0]):
-        _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(pressures.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)
+            chunk = next_chunk(turns, part, chunk_count(pressures.shape[0]))
 
 
 @inlined
@@ -173,29 +178,40 @@ def iterate_pressures(
         displacements: [m], (N, 3); those by `pressures` at the end.
         errors: (chunks,) float64; scratch.
     """
-    count = pressures.shape[0]
+    count, chunks = pressures.shape[0], errors.shape[0]
     least, most, steps = limits
     for _ in range(steps):
         known = state[ITERATION] == 0.0 and residuals.shape[0] == count
         if not known:
-            for s in prange(pairs.stop.shape[0]):
-                _displace(s * LANES, pairs, guesses, contact_gradients, cohesive, displacements)
+            turns = fresh_turns()
+            for part in prange(PARTS):
+                chunk = next_chunk(turns, part, chunks)
+                while chunk >= 0:
+                    for s in slices_of(chunk, pairs.stop.shape[0]):
+                        _displace(
+                            s * LANES, pairs, guesses, contact_gradients, cohesive, displacements
+                        )
+                    chunk = next_chunk(turns, part, chunks)
         inertia = state[INERTIA]
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia * inertia))
         share, momentum = np.float32(state[SHARE]), np.float32((inertia - 1.0) / grown)
-        for chunk in prange(errors.shape[0]):
-            error = 0.0
-            for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
-                if known:
-                    residual = take(residuals, row)
-                else:
-                    residual = take(densities, row) - np.float32(1.0)
-                    residual += _density_change(row, pairs, contact_gradients, displacements)
-                error += _correct(
-                    row, residual, yielded, compliance, diagonal, share, momentum, pressures,
-                    guesses,
-                )  # fmt: skip
-            errors[chunk] = error
+        again = fresh_turns()
+        for part in prange(PARTS):
+            chunk = next_chunk(again, part, chunks)
+            while chunk >= 0:
+                error = 0.0
+                for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
+                    if known:
+                        residual = take(residuals, row)
+                    else:
+                        residual = take(densities, row) - np.float32(1.0)
+                        residual += _density_change(row, pairs, contact_gradients, displacements)
+                    error += _correct(
+                        row, residual, yielded, compliance, diagonal, share, momentum, pressures,
+                        guesses,
+                    )  # fmt: skip
+                errors[chunk] = error
+                chunk = next_chunk(again, part, chunks)
         sum_of_errors = 0.0
         for chunk in range(errors.shape[0]):
             sum_of_errors += errors[chunk]
@@ -216,5 +232,12 @@ def iterate_pressures(
                 pressures[i] = guesses[i] = first[i]
         state[BEST] = min(state[BEST], error)
     if state[DONE] > 0.0:
-        for s in prange(pairs.stop.shape[0]):
-            _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)
+        last = fresh_turns()
+        for part in prange(PARTS):
+            chunk = next_chunk(last, part, chunks)
+            while chunk >= 0:
+                for s in slices_of(chunk, pairs.stop.shape[0]):
+                    _displace(
+                        s * LANES, pairs, pressures, contact_gradients, cohesive, displacements
+                    )
+                chunk = next_chunk(last, part, chunks)

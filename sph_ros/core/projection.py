@@ -17,6 +17,7 @@ predicted lines of centres (a mode of squared frequency k: k dt^2 < 4 against 4/
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.contacts import (
     GRADIENT,
     SURFACE_VELOCITY,
@@ -24,7 +25,6 @@ from sph_ros.core.contacts import (
     to_world,
 )
 from sph_ros.core.jit import inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK, chunk_of_turn, turns
 from sph_ros.core.pair_sums import weights_after
 from sph_ros.core.vector import LANES, larger, smaller, spread, where
 from sph_ros.core.vector_memory import gather_column, lanes_from, put, take, take_points
@@ -66,20 +66,23 @@ def contact_velocities(positions, motion, inverse_step, contacts):
         still += is_still(motion, s)
     if still == motion.position.shape[0]:
         return
-    count, chunks = positions.shape[0], (positions.shape[0] + CHUNK - 1) // CHUNK
-    for turn in prange(turns(chunks)):
-        chunk = chunk_of_turn(turn, chunks)
-        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-            for k in range(contacts.start[i], contacts.end[i]):
-                s = solids[k]
-                if is_still(motion, s):
-                    continue
-                x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-                lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
-                nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
-                terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
-                terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
-                terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+    count, chunks = positions.shape[0], chunk_count(positions.shape[0])
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunks)
+        while chunk >= 0:
+            for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+                for k in range(contacts.start[i], contacts.end[i]):
+                    s = solids[k]
+                    if is_still(motion, s):
+                        continue
+                    x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+                    lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
+                    nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
+                    terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
+                    terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
+                    terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+            chunk = next_chunk(turns, part, chunks)
 
 
 @parallel_kernel
@@ -146,29 +149,34 @@ def density_targets(
     bend = power - np.float32(2.0)
     count, walls = targets.shape[0], contacts.density
     gradients = contacts.gradients
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        zero = spread(np.float32(0.0))
-        weights, linear = weights_after(
-            pairs, positions, displacements, first, support_radius, bend
-        )
-        now = take(density, first)
-        excess, mild = now - one, spread(MILD)
-        back = share * smaller(excess, mild) + rest * larger(excess - mild, zero)
-        wanted = where(excess > zero, back, excess)
-        wall = gather_column(walls, lanes_from(first, count), 0)
-        wanted += density_scale * weights - (now - wall)
-        put(wanted - linear + one, targets, first)
-        x, y, z = take_points(displacements, first, 0)
-        gx, gy, gz = take_points(gradients, first, 0)
-        put(wanted + gx * x + gy * y + gz * z, residuals, first)
-        for i in range(first, min(first + LANES, count)):
-            for k in range(contacts.start[i], contacts.end[i]):
-                t = contacts.terms[k]
-                for axis in range(3):
-                    brought = time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
-                    targets[i] -= brought
-                    residuals[i] -= brought
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(count))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                zero = spread(np.float32(0.0))
+                weights, linear = weights_after(
+                    pairs, positions, displacements, first, support_radius, bend
+                )
+                now = take(density, first)
+                excess, mild = now - one, spread(MILD)
+                back = share * smaller(excess, mild) + rest * larger(excess - mild, zero)
+                wanted = where(excess > zero, back, excess)
+                wall = gather_column(walls, lanes_from(first, count), 0)
+                wanted += density_scale * weights - (now - wall)
+                put(wanted - linear + one, targets, first)
+                x, y, z = take_points(displacements, first, 0)
+                gx, gy, gz = take_points(gradients, first, 0)
+                put(wanted + gx * x + gy * y + gz * z, residuals, first)
+                for i in range(first, min(first + LANES, count)):
+                    for k in range(contacts.start[i], contacts.end[i]):
+                        t = contacts.terms[k]
+                        for axis in range(3):
+                            brought = time_step * t[GRADIENT + axis] * t[SURFACE_VELOCITY + axis]
+                            targets[i] -= brought
+                            residuals[i] -= brought
+            chunk = next_chunk(turns, part, chunk_count(count))
 
 
 @parallel_kernel

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.jit import parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.pair_sums import STEPS, impulse_of_pairs
 from sph_ros.core.vector import LANES, spread
 from sph_ros.core.vector_memory import gather, load, put, take, take_points
@@ -80,26 +80,31 @@ def cohesive_displacements(pairs, sums, contact_gradients, tension, weight_ratio
     offset = cohesion + tension.near
     density, near_density = sums.density, sums.near_density
     step = weight_ratio / STEPS
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        own = cohesion * take(density, first) - offset
-        own_near = near * take(near_density, first)
-        x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
-        for k in range(pairs.start[first], pairs.stop[s], LANES):
-            j = load(pairs.neighbors, k)
-            both = own + (cohesion * gather(density, j) - offset)
-            both_near = own_near + near * gather(near_density, j)
-            c = both + step * load(pairs.nearness, k) * both_near
-            x += c * load(pairs.x, k)
-            y += c * load(pairs.y, k)
-            z += c * load(pairs.z, k)
-        unit, wall = -pairs.unit[0], tension.adhesion * own
-        gx, gy, gz = take_points(contact_gradients, first, 0)
-        nx, ny, nz = take_points(contact_gradients, first, 3)
-        x = unit * x - wall * gx - own_near * nx
-        y = unit * y - wall * gy - own_near * ny
-        z = unit * z - wall * gz - own_near * nz
-        put((x, y, z), displacements, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(density.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                own = cohesion * take(density, first) - offset
+                own_near = near * take(near_density, first)
+                x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
+                for k in range(pairs.start[first], pairs.stop[s], LANES):
+                    j = load(pairs.neighbors, k)
+                    both = own + (cohesion * gather(density, j) - offset)
+                    both_near = own_near + near * gather(near_density, j)
+                    c = both + step * load(pairs.nearness, k) * both_near
+                    x += c * load(pairs.x, k)
+                    y += c * load(pairs.y, k)
+                    z += c * load(pairs.z, k)
+                unit, wall = -pairs.unit[0], tension.adhesion * own
+                gx, gy, gz = take_points(contact_gradients, first, 0)
+                nx, ny, nz = take_points(contact_gradients, first, 3)
+                x = unit * x - wall * gx - own_near * nx
+                y = unit * y - wall * gy - own_near * ny
+                z = unit * z - wall * gz - own_near * nz
+                put((x, y, z), displacements, first)
+            chunk = next_chunk(turns, part, chunk_count(density.shape[0]))
 
 
 @parallel_kernel
@@ -123,13 +128,18 @@ def viscous_impulses(
         changed: velocities afterwards [m/s], (N, 3); written.
     """
     inverse_h = np.float32(1.0) / support_radius
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        x, y, z = impulse_of_pairs(
-            pairs, positions, velocities, first, inverse_h, linear, quadratic, most
-        )
-        vx, vy, vz = take_points(velocities, first, 0)
-        put((vx - x, vy - y, vz - z), changed, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                x, y, z = impulse_of_pairs(
+                    pairs, positions, velocities, first, inverse_h, linear, quadratic, most
+                )
+                vx, vy, vz = take_points(velocities, first, 0)
+                put((vx - x, vy - y, vz - z), changed, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
 
 
 @parallel_kernel
@@ -144,20 +154,25 @@ def viscous_operator(pairs, positions, velocities, support_radius, linear, resul
         result: [m/s], (N, 3); written.
     """
     inverse_h = np.float32(1.0) / support_radius
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        x, y, z = impulse_of_pairs(
-            pairs,
-            positions,
-            velocities,
-            first,
-            inverse_h,
-            linear,
-            np.float32(0.0),
-            np.float32(np.inf),
-        )
-        vx, vy, vz = take_points(velocities, first, 0)
-        put((vx + x, vy + y, vz + z), result, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                x, y, z = impulse_of_pairs(
+                    pairs,
+                    positions,
+                    velocities,
+                    first,
+                    inverse_h,
+                    linear,
+                    np.float32(0.0),
+                    np.float32(np.inf),
+                )
+                vx, vy, vz = take_points(velocities, first, 0)
+                put((vx + x, vy + y, vz + z), result, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
 
 
 @parallel_kernel

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contact_data import (
     DISTANCE,
     FRACTION,
@@ -26,7 +27,6 @@ from sph_ros.core.contact_data import (
     write_surface_velocity,
 )
 from sph_ros.core.jit import called, inlined, parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.sheets import (
     CORNER_CONTACTS,
     cell_of,

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import CHUNK
 from sph_ros.core.jit import device, parallel_kernel
-from sph_ros.core.neighbors import CHUNK
 from sph_ros.core.vector import LANES
 
 _TABLE = 256

@@ -12,8 +12,11 @@ MIXING_SOLVERS = ("forces", "lennard_jones", "none")
 #: Those that make particles one liquid, with a density to hold; they know springs, too.
 LIQUID_SOLVERS = ("relaxation", "incompressible", "forces")
 
+#: Those that find pressures by iteration.
+PRESSURE_SOLVERS = ("relaxation", "incompressible")
+
 #: Those whose particles may turn.
-SPIN_SOLVERS = ("relaxation", "incompressible")
+SPIN_SOLVERS = PRESSURE_SOLVERS
 
 
 def alike(one, other):

@@ -21,7 +21,7 @@ from numba import config
 from numba.core import caching, event
 
 from sph_ros.core.jit import KERNELS
-from sph_ros.sim.abilities import LIQUID_SOLVERS, SOLVERS, SPIN_SOLVERS
+from sph_ros.sim.abilities import LIQUID_SOLVERS, PRESSURE_SOLVERS, SOLVERS, SPIN_SOLVERS
 from sph_ros.sim.shape_types import Mesh, OpenSurface
 
 #: Set for the children, which must not have children of their own.
@@ -30,17 +30,22 @@ COMPILING = "SPH_ROS_COMPILING"
 LONGEST = 900.0  # [s]
 
 #: What scenes may have beside a solver; each has kernels of its own.
-FEATURES = ("bodies", "sheets", "meshes", "springs", "spins")
+FEATURES = ("bodies", "sheets", "meshes", "springs", "spins", "thick", "tension")
 
-#: Those that a material may have -> its solvers.
-MATERIAL_FEATURES = {"springs": LIQUID_SOLVERS, "spins": SPIN_SOLVERS}
+#: Those that a material may have -> its solvers. `relaxation` has its tension always.
+MATERIAL_FEATURES = {
+    "springs": LIQUID_SOLVERS,
+    "spins": SPIN_SOLVERS,
+    "thick": PRESSURE_SOLVERS,
+    "tension": ("incompressible",),
+}
 
 #: Functions that the first scene of all needs, about: for reports of progress.
 FUNCTIONS = 200
 
 _SCENE = {
     "spacing": 0.02,
-    "material": "honey",
+    "material": "water",
     "liquid": [{"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}}],
     "emitters": [
         {"position": [0.05, 0.05, 0.27], "radius": 0.01, "speed": 2.0, "from": 0.0, "limit": 3}
@@ -66,7 +71,12 @@ _BODY = {
     "density": 500.0,
 }
 
-_MATERIALS = {"springs": "cream", "spins": {"base": "honey", "gyration_radius": 0.1}}
+_MATERIALS = {
+    "springs": "cream",
+    "spins": {"base": "water", "gyration_radius": 0.1},
+    "thick": {"base": "honey", "viscosity": 1000.0},
+    "tension": {"base": "water", "surface_tension": 5.0},
+}
 
 #: A triangle in the middle of the liquid, and a tetrahedron above it.
 _SHEET = "v 0 0 0.05\nv 0.1 0 0.05\nv 0 0.1 0.05\nf 1 2 3"
@@ -96,17 +106,26 @@ def needs(scene):
     return [
         scene.solver,
         *(f"{scene.solver}+{name}" for name, needed in has.items() if needed),
-        *needs_of_material(scene.material, scene.solver),
+        *needs_of_material(scene.material, scene),
     ]
 
 
-def needs_of_material(material, solver):
-    """Names of what has to be compiled for a material beside what all need."""
-    has = {"springs": material.elasticity > 0.0, "spins": material.gyration_radius > 0.0}
+def needs_of_material(material, scene):
+    """Names of what has to be compiled for a material in a scene beside what all need."""
+    # Scenes are checked by means of compiled kernels, so what knows about them is loaded late.
+    from sph_ros.sim.surface_tension import noticeable
+    from sph_ros.sim.viscosity import may_be_implicit
+
+    has = {
+        "springs": material.elasticity > 0.0,
+        "spins": material.gyration_radius > 0.0,
+        "thick": may_be_implicit(material, scene),
+        "tension": noticeable(material, scene),
+    }
     return [
-        f"{solver}+{name}"
+        f"{scene.solver}+{name}"
         for name, solvers in MATERIAL_FEATURES.items()
-        if has[name] and solver in solvers
+        if has[name] and scene.solver in solvers
     ]
 
 
@@ -250,9 +269,6 @@ def _take_every_way(scene, dimension):
     simulation = Simulation({**scene, "dimension": dimension})
     if scene["solids"]:
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
-    simulation.step()
-    # So taut that it is noticed at this spacing.
-    simulation.set_material(viscosity=0.001, surface_tension=5.0)
     simulation.advance(0.02)
     simulation.statistics()
     simulation.surface()

@@ -389,8 +389,11 @@ def _packed_grids(grids: list[DistanceGrid], columns: list[int]) -> dict[str, np
         "grid_shape": _stacked([grid.distance.shape for grid in grids], np.int32, (3,)),
         "grid_start": _stacked(np.cumsum([0, *counts])[:-1], np.int64, ()),
         "grid_distance": np.concatenate([grid.distance.ravel() for grid in grids] or empty),
-        "grid_ratio": np.concatenate(
-            [grid.ratio.reshape(-1, 2)[:, columns] for grid in grids]
-            or [np.empty((0, 2), np.float32)]
+        # Taken columns lie in memory one after the other; kernels would be compiled again for that.
+        "grid_ratio": np.ascontiguousarray(
+            np.concatenate(
+                [grid.ratio.reshape(-1, 2)[:, columns] for grid in grids]
+                or [np.empty((0, 2), np.float32)]
+            )
         ),
     }

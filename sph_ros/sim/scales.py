@@ -76,6 +76,9 @@ LEAST_SMOOTH = 1.8
 #: Time in which the lattice at the start becomes liquid [s].
 MELTING_TIME = 0.5
 
+#: No automatic step is longer [s].
+LONGEST_STEP = 0.01
+
 #: Stands for sqrt(g H) where gravity does not set a speed [m/s].
 LEAST_SPEED = 0.3
 
@@ -177,10 +180,16 @@ def solver_scales(material, scene, depth):
         near_virial_ratio=virial / near_virial,
         viscous_rate=viscous_rate(material.viscosity / material.density, scene),
         quadratic=material.quadratic_viscosity / s,
-        neighbors=sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d,
+        neighbors=neighbor_sum(scene),
         wall_layers=_wall_layers(power, h, s, d),
         elasticity=material.elasticity,
     )
+
+
+def neighbor_sum(scene):
+    """(1 - r/h) summed over the lattice's neighbours, divided by the dimension [-]."""
+    h, s, d = scene.support_radius, scene.spacing, scene.dimension
+    return sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d
 
 
 def viscous_rate(kinematic, scene):
@@ -199,9 +208,7 @@ def longest_elastic_step(modulus, scene):
         modulus: shear modulus over density [m^2/s^2].
         scene: the scene.
     """
-    h, s, d = scene.support_radius, scene.spacing, scene.dimension
-    around = sum(1 - r / h for r, _ in lattice_neighbors(h, s, d) if r > 0.0) / d
-    return 1.0 / math.sqrt(2.0 * viscous_rate(modulus, scene) * around)
+    return 1.0 / math.sqrt(2.0 * viscous_rate(modulus, scene) * neighbor_sum(scene))
 
 
 def surface_energy(support_radius, spacing, dimension):
@@ -293,7 +300,7 @@ def stable_time_step(scene, scales, drop, courant, ripples=math.inf):
     if scales.elasticity > 0:
         bounds["elasticity"] = longest_elastic_step(scales.elasticity / scales.rest_density, scene)
     reason = min(bounds, key=bounds.get)
-    step = min(bounds[reason], 0.01)
+    step = min(bounds[reason], LONGEST_STEP)
     return (readable_step(step), reason if step == bounds[reason] else "10 ms at most")
 
 

@@ -101,7 +101,7 @@ class Simulation:
         for field, fault in faults(self.scene, [material, *others]):
             used = dataclasses.replace(used, **{field: 0.0})
             self.notes.append(f"{field}: {fault}; 0 is used")
-        ensure_compiled(needs_of_material(used, self.scene.solver))
+        ensure_compiled(needs_of_material(used, self.scene))
         self._stable_step, _ = self._stable_step_of(used)
 
     def _stable_step_of(self, material):

@@ -9,6 +9,7 @@ import numpy as np
 from sph_ros.core import contacts as touch
 from sph_ros.core import neighbors as search
 from sph_ros.core import sheet_contacts as sheets
+from sph_ros.core.chunks import chunk_count
 from sph_ros.core.rows import bounding_box
 from sph_ros.core.wall_tables import POWERS
 from sph_ros.sim.abilities import alike
@@ -174,7 +175,7 @@ class Solver:
             Force [N] and torque [N m] on each solid, (S, 6) float64.
         """
         solids = self._solids
-        reactions = np.zeros((max(search.chunk_count(len(fluid)), 1), len(solids), 6))
+        reactions = np.zeros((max(chunk_count(len(fluid)), 1), len(solids), 6))
         if len(solids.sheets.solid) and solids.sheets.bounce.any():
             sheets.bounce_off_sheets(
                 fluid.positions,

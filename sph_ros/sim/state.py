@@ -3,8 +3,9 @@
 
 import numpy as np
 
+from sph_ros.core.chunks import CHUNK, chunk_count
 from sph_ros.core.contacts import TERMS, Contacts
-from sph_ros.core.neighbors import CHUNK, Grid, Sums, chunk_count
+from sph_ros.core.neighbors import Grid, Sums
 from sph_ros.core.pair_sums import Pairs
 from sph_ros.core.rows import gather_state
 from sph_ros.core.vector import LANES

@@ -8,6 +8,7 @@ import numpy as np
 from sph_ros.core import contacts as touch
 from sph_ros.core import relaxation as relax
 from sph_ros.core.drag import add_drag, drag_reactions
+from sph_ros.sim.scales import LONGEST_STEP, neighbor_sum, viscous_rate
 
 #: Share of its speed relative to all neighbours that a particle may lose explicitly in a step. A
 #: pair takes a share c along its line, so N neighbours all around take N c / dimension; from 1 on
@@ -43,6 +44,13 @@ class Rates(NamedTuple):
     def implicit(self):
         """Whether the linear part is too strong for explicit impulses."""
         return self.linear * self.neighbors > EXPLICIT_LIMIT
+
+
+def may_be_implicit(material, scene):
+    """Whether viscosity has to be implicit in the longest step that there can be."""
+    rate = viscous_rate(material.viscosity / material.density, scene)
+    step = max(scene.time_step or 0.0, LONGEST_STEP)
+    return rate * step * neighbor_sum(scene) > EXPLICIT_LIMIT
 
 
 def apply_viscosity(work, fluid, rates, motion):
