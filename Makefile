@@ -58,13 +58,11 @@ test: $(READY)
 	$(BIN)/python -m pytest -q $(ARGS)
 
 bench: $(READY)
-	@for script in benchmarks/bench_*.py; do \
-	  echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit 1; \
-	done
+	$(BIN)/python benchmarks/run.py $(ARGS)
 
 # The pictures of the README: last frames of offline runs, and the webcam's film; takes half an hour.
 # A scene and the moment of its picture [s]:
-MOMENTS := desk_tank:0.5 dam_break:0.5 dam_break_2d:0.35 resting_column:0.5 pour_glass:1.2 dam_house_2d:1.8 \
+MOMENTS := desk_tank:0.5 dam_break:0.5 dam_break_2d:0.35 dam_break_large:0.5 resting_column:0.5 pour_glass:1.2 dam_house_2d:1.8 \
   drops_merge:0.3 stirred_cup:1.6 floating_boat:1.5 ball_splash:0.3 oil_water:1.2 fountain:1.2 \
   honey_spoon:2 cream:3 jelly:0.1 lennard_jones:1
 FFMPEG = "$$($(BIN)/python -c 'import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())')" -y -loglevel error

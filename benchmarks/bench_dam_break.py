@@ -5,7 +5,8 @@
 
 Box 1.0 x 0.5 x 0.5 m, block 0.4 x 0.5 x 0.4 m, h = 2 spacings. Each run has a process of its own;
 the clock runs from the first step after kernels are loaded to the end, publishing and surface not
-counted. Wall time is the machine's, so free it first; compare rows of one run only.
+counted. Wall time is the machine's, so free it first; compare rows of one run only. Where pip has
+installed pysplishsplash, SPlisHSPlasH runs the first tenths of a second of the smaller ones, too.
 """
 
 import argparse
@@ -17,10 +18,15 @@ import subprocess
 import sys
 import time
 
+import peer_splishsplash as peer
+
 #: Spacings [m] and the numbers of particles that they make.
 SPACINGS = {0.025: 5_120, 0.016: 19_375, 0.0091: 106_000}
 
 WARM_UP = 3  # steps
+
+#: What the peer is given: no finer spacings [m], no more seconds.
+PEER_SPACING, PEER_SECONDS = 0.015, 0.3
 
 
 def scene(spacing, solver):
@@ -79,6 +85,34 @@ def measure(spacing, solver, seconds):
     }
 
 
+def peer_rows(spacings, seconds):
+    """The same by SPlisHSPlasH, shown as they come; none where it is not installed."""
+    rows = []
+    if not peer.installed():
+        print("SPlisHSPlasH is left out: pip install pysplishsplash, to have it run beside")
+        return rows
+    for tuned in (False, True):
+        for spacing in spacings:
+            try:
+                rows.append(peer.run(spacing, min(seconds, PEER_SECONDS), tuned))
+            except RuntimeError as error:
+                print(error)
+                continue
+            show(rows[-1])
+    return rows
+
+
+def show(row):
+    """Print a row on one line."""
+    print(
+        "  ".join(
+            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
+            for key, value in row.items()
+        ),
+        flush=True,
+    )
+
+
 def plot(rows, path):
     """Factor over particles, a line for each solver."""
     import matplotlib
@@ -118,13 +152,8 @@ def main():
             command += ["--seconds", str(options.seconds)]
             found = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
             rows.append(json.loads(found.stdout))
-            print(
-                "  ".join(
-                    f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
-                    for key, value in rows[-1].items()
-                ),
-                flush=True,
-            )
+            show(rows[-1])
+    rows += peer_rows([s for s in options.spacings if s >= PEER_SPACING], options.seconds)
     if options.plot:
         plot(rows, options.plot)
         print(options.plot)

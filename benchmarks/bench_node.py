@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast fluid_node is with everything on, and how long a pose takes to show: two real processes.
 
-    python benchmarks/bench_node.py [--scene ball_tank_large] [--seconds 5]
+    python benchmarks/bench_node.py [--scenes dam_break_large ball_tank_large] [--seconds 5]
 
 The node runs with `speed` so high that it never waits: the real-time factor is then what the
-machine can do. The hand moves at 0.24 m/s of simulated time. Latency is measured at speed 1, with
-every step published, in this scene and in a small one: a pose 2 mm away is sent, and the time is
-taken until a ~/solids message arrives here in which the ball has begun to move, and one in which it
-has arrived. Arriving takes `smoothing_time` (50 ms) by design when poses are as rare as here. The
-bound is two steps and 5 ms, a step as long as it takes.
+machine can do. The hand moves on a circle at 0.24 m/s of simulated time. Latency is measured at
+speed 1, with every step published: a pose 2 mm away is sent, and the time is taken until a ~/solids
+message arrives here in which the ball has begun to move, and one in which it has arrived. Arriving
+takes `smoothing_time` (50 ms) by design when poses are as rare as here. The bound is two steps and
+5 ms, a step as long as it takes.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,11 +37,26 @@ from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 from msg_adapters.marker import cdr_to_markers  # noqa: E402
 from msg_adapters.pose import pose_to_cdr  # noqa: E402
 
-CENTER = np.array([0.1, 0.1, 0.08])
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
-#: Of the hand on its circle, in simulated time [rad/s]: the ball moves at 0.24 m/s.
-ANGULAR_SPEED = 6.0
+
+class Circle(NamedTuple):
+    """Where a hand goes round: centre and radius [m], speed in simulated time [m/s]."""
+
+    center: tuple
+    radius: float
+    speed: float = 0.24
+
+
+#: Of the scenes' hands.
+CIRCLES = {
+    "dam_break_large": Circle((0.5, 0.25, 0.08), 0.12),
+    "ball_tank_large": Circle((0.1, 0.1, 0.08), 0.04),
+    "ball_tank": Circle((0.1, 0.1, 0.08), 0.04),
+}
+
+#: Latency is measured in this small one, too.
+SMALL = "ball_tank"
 
 PARTICLES = ("particles", PointCloud2)
 OTHERS = (("solids", MarkerArray), ("solids/ball/wrench", WrenchStamped))
@@ -56,9 +72,14 @@ LOADS = (
 
 
 class Bench:
-    """A client of a fluid_node process."""
+    """A client of a fluid_node process.
+
+    Attributes:
+        circle: the hand's way in the scene that runs.
+    """
 
     def __init__(self):
+        self.circle = None
         rclpy.init(args=[])
         self.node = rclpy.create_node("bench")
         self.executor = SingleThreadedExecutor()
@@ -130,9 +151,10 @@ class Bench:
             if pose_rate:
                 # A node in slow motion would take this hand for one that is so much faster.
                 pace = min(float(self.facts[-1]["real_time_factor"]), 1.0) if self.facts else 0.2
-                self.angle += pace * ANGULAR_SPEED * (time.monotonic() - last)
+                center, radius, speed = self.circle
+                self.angle += pace * speed / radius * (time.monotonic() - last)
                 turned = np.array([np.cos(self.angle), np.sin(self.angle), 0.0])
-                self.send(CENTER + 0.04 * turned)
+                self.send(center + radius * turned)
             last = time.monotonic()
             time.sleep(1.0 / (pose_rate or 10.0))
 
@@ -149,16 +171,17 @@ class Bench:
         subscription = self.node.create_subscription(
             MarkerArray, "/fluid/solids", look, QoSProfile(depth=2), raw=True
         )
-        self.send(CENTER)
+        *place, height = self.circle.center
+        self.send((*place, height))
         time.sleep(1.0)
-        result, old = [], CENTER[2]
+        result, old = [], height
         for number in range(count):
-            new = CENTER[2] + (0.002 if number % 2 == 0 else 0.0)
+            new = height + (0.002 if number % 2 == 0 else 0.0)
             time.sleep(0.2 + 0.0137 * (number % 7))  # not in step with the publications
             with ready:
                 heights.clear()
             sent = time.monotonic()
-            self.send((*CENTER[:2], new))
+            self.send((*place, new))
             moments = []
             for goal in (lambda z, old=old: abs(z - old) > 1e-5, lambda z: abs(z - new) < 1e-5):  # noqa: B023
                 with ready:
@@ -182,6 +205,7 @@ def start_node(scene, **parameters):
 
 @contextmanager
 def running(bench, scene, **parameters):
+    bench.circle = CIRCLES[scene]
     process = start_node(scene, **parameters)
     try:
         deadline = time.monotonic() + 180.0
@@ -212,34 +236,41 @@ def print_latencies(bench, scene, poses):
         )
 
 
+def measure_loads(bench, scene, seconds):
+    """Measure and print how fast a scene runs under each load."""
+    print(f"{scene}: real-time factor that is possible, {os.cpu_count()} cores")
+    print(f"{'':24}{'factor':>8}{'step ms':>9}{'clouds Hz':>11}{'surfaces Hz':>13}")
+    with running(bench, scene, speed=100.0, surface_rate=15.0):
+        for name, topics, pose_rate in LOADS:
+            row = bench.load(topics, pose_rate, seconds)
+            print(
+                f"{name:24}{row['factor']:8.2f}{row['step']:9.2f}"
+                f"{row['particles']:11.1f}{row['surfaces']:13.1f}",
+                flush=True,
+            )
+    facts = row["facts"]
+    print(
+        f"{facts['particles']} particles, surface of {facts['surface_triangles']} triangles in "
+        f"{float(facts['surface_time_ms']):.1f} ms, "
+        f"{float(facts['skipped_time']):.0f} s left out (the speed is out of reach on purpose)"
+    )
+    parts = {k[10:-3]: float(v) for k, v in facts.items() if k.startswith("step_time_")}
+    parts.pop("", None)
+    print("ms per step: " + ", ".join(f"{k} {v:.2f}" for k, v in parts.items() if k))
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scene", default="ball_tank_large")
+    scenes = [scene for scene in CIRCLES if scene != SMALL]
+    parser.add_argument("--scenes", nargs="+", default=scenes, choices=CIRCLES)
     parser.add_argument("--seconds", type=float, default=5.0, help="per load (5)")
     parser.add_argument("--poses", type=int, default=60, help="poses for the latency (60)")
     options = parser.parse_args()
     bench = Bench()
     try:
-        print(f"{options.scene}: real-time factor that is possible, {os.cpu_count()} cores")
-        print(f"{'':24}{'factor':>8}{'step ms':>9}{'clouds Hz':>11}{'surfaces Hz':>13}")
-        with running(bench, options.scene, speed=100.0, surface_rate=15.0):
-            for name, topics, pose_rate in LOADS:
-                row = bench.load(topics, pose_rate, options.seconds)
-                print(
-                    f"{name:24}{row['factor']:8.2f}{row['step']:9.2f}"
-                    f"{row['particles']:11.1f}{row['surfaces']:13.1f}",
-                    flush=True,
-                )
-        facts = row["facts"]
-        print(
-            f"{facts['particles']} particles, surface of {facts['surface_triangles']} triangles in "
-            f"{float(facts['surface_time_ms']):.1f} ms, "
-            f"{float(facts['skipped_time']):.0f} s left out (the speed is out of reach on purpose)"
-        )
-        parts = {k[10:-3]: float(v) for k, v in facts.items() if k.startswith("step_time_")}
-        parts.pop("", None)
-        print("ms per step: " + ", ".join(f"{k} {v:.2f}" for k, v in parts.items() if k))
-        for scene in (options.scene, "ball_tank"):
+        for scene in options.scenes:
+            measure_loads(bench, scene, options.seconds)
+        for scene in [*options.scenes, SMALL]:
             with running(bench, scene, speed=1.0, publish_rate=500.0):
                 print_latencies(bench, scene, options.poses)
     finally:

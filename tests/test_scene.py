@@ -70,6 +70,7 @@ EXPECTED_PARTICLES = {
     "ball_tank_large": (19_000, 21_000),
     "dam_break": (5120, 5120),
     "dam_break_2d": (3200, 3200),
+    "dam_break_large": (19_375, 19_375),
     "dam_house_2d": (300, 300),  # 3 m^2 at 0.1 m
     "desk_tank": (1536, 1536),
     "drop_box": (2100, 2300),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`append_within` appends the indices of near points.
+"""`append_near` appends the indices of near points.
 
 The search for neighbours compares some 200 candidates for 30 hits; as a scalar loop that costs more
 than everything else in a step. Sixteen candidates are compared at once here, and the hits are
@@ -16,8 +16,8 @@ from sph_ros.core.vector import HAS_AVX512, INT32, INTERPRETED, LANES, WHOLE, co
 from sph_ros.core.vector_memory import data_pointer, load_vector, store_vector
 
 
-def _store_set_bits(builder, bits, first, pointer, cursor):
-    """Store first + (position of each set bit) one after the other; the new cursor."""
+def _store_set_bits(builder, bits, indices, pointer, cursor):
+    """Store indices[position of each set bit] one after the other; the new cursor."""
     int32 = bits.type
     rest = cgutils.alloca_once_value(builder, bits)
     stored = cgutils.alloca_once_value(builder, ir.Constant(cursor.type, 0))
@@ -31,7 +31,7 @@ def _store_set_bits(builder, bits, first, pointer, cursor):
     builder.position_at_end(body)
     lane = builder.cttz(now, ir.Constant(ir.IntType(1), 0))
     place = builder.load(stored)
-    builder.store(builder.add(first, lane), builder.gep(pointer, [place]))
+    builder.store(builder.load(builder.gep(indices, [lane])), builder.gep(pointer, [place]))
     builder.store(builder.add(place, ir.Constant(place.type, 1)), stored)
     builder.store(builder.and_(now, builder.sub(now, ir.Constant(int32, 1))), rest)
     builder.branch(test)
@@ -40,44 +40,43 @@ def _store_set_bits(builder, bits, first, pointer, cursor):
 
 
 @intrinsic
-def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cursor):
+def append_near(typingctx, xs, ys, zs, indices, begin, x, y, z, square, target, cursor):
     """Append to `target` the indices of those of 16 points that are nearer than a radius.
 
     Args:
-        xs, ys, zs: coordinates, each with 16 readable elements from `begin` on, (N,) float32.
-        begin, end: points begin .. min(begin + 16, end) - 1 are compared.
+        xs, ys, zs: coordinates, (N,) float32; the points are begin ... begin + 15.
+        indices: of the points, (N,) uint32.
+        begin: the first of them.
         x, y, z: centre, float32.
         square: the radius squared, float32.
-        target: indices are written from target[cursor] on; 16 elements must be free, (M,) int32.
+        target: indices are written from target[cursor] on; 16 elements must be free, (M,) uint32.
         cursor: where to write.
 
     Returns:
         The new cursor.
     """
-    signature = types.intp(xs, ys, zs, types.intp, types.intp, x, y, z, square, target, types.intp)
+    signature = types.intp(xs, ys, zs, indices, types.intp, x, y, z, square, target, types.intp)
 
     def codegen(context, builder, sig, args):
-        xs_, ys_, zs_, begin_, end_, x_, y_, z_, square_, target_, cursor_ = args
+        *arrays, begin_, x_, y_, z_, square_, target_, cursor_ = args
+        *pointers, indices_, target_ = (
+            data_pointer(context, builder, array_type, array)
+            for array_type, array in zip(
+                (*sig.args[:4], sig.args[9]), (*arrays, target_), strict=True
+            )
+        )
         distance = None
-        for array_type, array, centre in zip(
-            sig.args[:3], (xs_, ys_, zs_), (x_, y_, z_), strict=True
-        ):
-            values = load_vector(builder, data_pointer(context, builder, array_type, array), begin_)
+        for pointer, centre in zip(pointers, (x_, y_, z_), strict=True):
+            values = load_vector(builder, pointer, begin_)
             offset = builder.fsub(splat(builder, centre), values)
             term = builder.fmul(offset, offset, flags=("contract",))
             distance = (
                 term if distance is None else builder.fadd(distance, term, flags=("contract",))
             )
         near = builder.fcmp_ordered("<", distance, splat(builder, square_))
-        lanes = ir.Constant(WHOLE, list(range(LANES)))
-        room = builder.trunc(builder.sub(end_, begin_), INT32)
-        mask = builder.and_(near, builder.icmp_signed("<", lanes, splat(builder, room)))
-        bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), INT32)
-        first = builder.trunc(begin_, INT32)
-        target_data = data_pointer(context, builder, sig.args[9], target_)
-        target_pointer = builder.gep(target_data, [cursor_])
+        bits = builder.zext(builder.bitcast(near, ir.IntType(LANES)), INT32)
+        target_pointer = builder.gep(target_, [cursor_])
         if HAS_AVX512:
-            indices = builder.add(lanes, splat(builder, first))
             # In a register and then stored whole: the instruction that stores only the hits is
             # several times slower.
             compress = cgutils.get_or_insert_function(
@@ -85,24 +84,26 @@ def append_within(typingctx, xs, ys, zs, begin, end, x, y, z, square, target, cu
                 ir.FunctionType(WHOLE, [WHOLE, WHOLE, near.type]),
                 f"llvm.x86.avx512.mask.compress.v{LANES}i32",
             )
-            hits = builder.call(compress, [indices, constant(0, WHOLE), mask])
+            found = load_vector(builder, indices_, begin_)
+            hits = builder.call(compress, [found, constant(0, WHOLE), near])
             store_vector(builder, hits, target_pointer, ir.Constant(cursor_.type, 0))
             count = builder.ctpop(bits)
             return builder.add(cursor_, builder.zext(count, cursor_.type))
-        return _store_set_bits(builder, bits, first, target_pointer, cursor_)
+        indices_ = builder.gep(indices_, [begin_])
+        return _store_set_bits(builder, bits, indices_, target_pointer, cursor_)
 
     return signature, codegen
 
 
-def _append_within_plainly(xs, ys, zs, begin, end, x, y, z, square, target, cursor):
-    """What `append_within` does, one point after the other."""
-    for k in range(begin, min(begin + LANES, end)):
+def _append_near_plainly(xs, ys, zs, indices, begin, x, y, z, square, target, cursor):
+    """What `append_near` does, one point after the other."""
+    for k in range(begin, begin + LANES):
         dx, dy, dz = x - xs[k], y - ys[k], z - zs[k]
         if dx * dx + dy * dy + dz * dz < square:
-            target[cursor] = k
+            target[cursor] = indices[k]
             cursor += 1
     return cursor
 
 
 if INTERPRETED:
-    append_within = _append_within_plainly
+    append_near = _append_near_plainly

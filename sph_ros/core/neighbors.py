@@ -16,19 +16,18 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
-from sph_ros.core.near_points import append_within
+from sph_ros.core.near_points import append_near
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
-from sph_ros.core.vector import LANES, inverse_root, larger, spread, where_whole
+from sph_ros.core.vector import LANES, inverse_root, larger, spread
 from sph_ros.core.vector_memory import (
-    gather,
     gather_column,
     gather_points,
     lanes_from,
     load,
     put,
     store,
-    take,
     take_points,
+    turn,
 )
 
 
@@ -112,26 +111,55 @@ def sort_by_cell(positions, grid, cell_of, order):
 
 
 @inlined
-def append_neighbors(i, columns, grid, square, neighbors, cursor, limit):
-    """Append the neighbours of particle i; the new cursor, or -1 where there is no room."""
-    xs, ys, zs = columns[grid.axes[0]], columns[grid.axes[1]], columns[grid.axes[2]]
-    x, y, z = xs[i], ys[i], zs[i]
+def cell_of_particle(i, columns, grid):
+    """Coordinates of the cell of particle i along the grid's axes."""
+    a, b, c = grid.axes[0], grid.axes[1], grid.axes[2]
     nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
-    cx = cell_coordinate(x, grid.lower[0], grid.inverse_cell, nx)
-    cy = cell_coordinate(y, grid.lower[1], grid.inverse_cell, ny)
-    cz = cell_coordinate(z, grid.lower[2], grid.inverse_cell, nz)
+    return (
+        cell_coordinate(columns[a, i], grid.lower[0], grid.inverse_cell, nx),
+        cell_coordinate(columns[b, i], grid.lower[1], grid.inverse_cell, ny),
+        cell_coordinate(columns[c, i], grid.lower[2], grid.inverse_cell, nz),
+    )
+
+
+@inlined
+def bring_together(cell, columns, grid, near, indices):
+    """Copy what is around a cell; returns how much that is, or -1 where it has no room.
+
+    It lies in nine runs of three cells along the fastest axis. Two vectors of each are copied in
+    any case: nearly always that is enough, and the processor has nothing to guess.
+
+    Args:
+        cell: from `cell_of_particle`.
+        columns: as in `find_neighbors`.
+        grid: from `sort_by_cell`.
+        near: coordinates of the candidates, (3, M); written, the last vector filled up with places
+            that are near nothing.
+        indices: of the candidates, (M,) uint32; written.
+    """
+    xs, ys, zs, x, y, z = columns[0], columns[1], columns[2], near[0], near[1], near[2]
+    cx, cy, cz = cell
+    nx, ny, nz = grid.counts[0], grid.counts[1], grid.counts[2]
     first, last = max(cx - 1, 0), min(cx + 1, nx - 1)
+    count, everywhere = np.intp(0), np.intp(xs.shape[0])
     for kz in range(max(cz - 1, 0), min(cz + 2, nz)):
         for ky in range(max(cy - 1, 0), min(cy + 2, ny)):
             row = (kz * ny + ky) * nx
             begin = np.intp(grid.cell_start[row + first])
-            end = np.intp(grid.cell_start[row + last + 1])
-            while begin < end:
-                if cursor + LANES > limit:
-                    return np.intp(-1)
-                cursor = append_within(xs, ys, zs, begin, end, x, y, z, square, neighbors, cursor)
-                begin += LANES
-    return cursor
+            length = np.intp(grid.cell_start[row + last + 1]) - begin
+            if count + length + 2 * LANES > indices.shape[0]:
+                return np.intp(-1)
+            for k in range(0, max(length, 2 * LANES), LANES):
+                store(load(xs, begin + k), x, count + k)
+                store(load(ys, begin + k), y, count + k)
+                store(load(zs, begin + k), z, count + k)
+                store(lanes_from(begin + k, everywhere), indices, count + k)
+            count += length
+    nowhere = spread(np.float32(np.inf))
+    store(nowhere, x, count)
+    store(nowhere, y, count)
+    store(nowhere, z, count)
+    return count
 
 
 @inlined
@@ -140,22 +168,24 @@ def store_slice(first, staged, pairs, cursor, width):
 
     Args:
         first: particle of the slice.
-        staged: the lists; those of particle i are staged[start[i]:end[i]] (M,) uint32.
-        pairs: lists are written, and their starts and ends changed to where they are then.
-        cursor: where the entries of the slice begin.
+        staged: the lists; that of particle first + k is staged[k], its length in end[first + k],
+            (LANES, M) uint32.
+        pairs: lists are written, and their starts and ends.
+        cursor: where the entries of the slice begin; there must be room for whole blocks of LANES
+            entries of each.
         width: length of its longest list.
     """
-    starts, ends, neighbors = pairs.start, pairs.end, pairs.neighbors
-    count = starts.shape[0]
-    own = lanes_from(first, count)
-    begins, stops = take(starts, first), take(ends, first)
-    for k in range(width):
-        places = begins + k
-        listed = places < stops
-        found = gather(staged, where_whole(listed, places, begins))
-        store(where_whole(listed, found, own), neighbors, cursor + k * LANES)
-    for i in range(first, min(first + LANES, count)):
-        length = ends[i] - starts[i]
+    starts, ends = pairs.start, pairs.end
+    last = starts.shape[0] - 1
+    for lane in range(LANES):
+        i = min(first + lane, last)
+        length = ends[i] if first + lane <= last else np.intp(0)
+        for k in range(length, width, LANES):
+            store(lanes_from(i, i + 1), staged[lane], k)
+    for k in range(0, width, LANES):
+        turn(staged, k, pairs.neighbors, cursor + k * LANES)
+    for i in range(first, min(first + LANES, last + 1)):
+        length = ends[i]
         starts[i] = cursor + i - first
         ends[i] = starts[i] + length * LANES
     pairs.stop[first // LANES] = cursor + width * LANES
@@ -166,7 +196,8 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     """Neighbour lists of all particles.
 
     Chunk k of `CHUNK` particles appends to its own part of the list, neighbors[k * room:(k + 1) *
-    room] with room = len(neighbors) // chunks, so nothing has to be counted first.
+    room] with room = len(neighbors) // chunks, so nothing has to be counted first. Particles of a
+    cell have the same candidates, which are brought together for them.
 
     Args:
         columns: cell-sorted coordinates [m], (3, N + padding) with N = len(pairs.start).
@@ -181,26 +212,39 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     count = pairs.start.shape[0]
     room = pairs.neighbors.shape[0] // chunks
     square = support_radius * support_radius
-    starts, ends = pairs.start, pairs.end
+    ends = pairs.end
+    xs, ys, zs = columns[0], columns[1], columns[2]
     turns = fresh_turns()
     full = np.zeros(PARTS, np.int64)
     for part in prange(PARTS):
         chunk = next_chunk(turns, part, chunks)
         while chunk >= 0:
-            staged = np.empty(room // 4 + LANES, np.uint32)
+            # Room for lists four times as long as the mean one, and for as many candidates as in a
+            # liquid eight times as dense as at rest.
+            longest, most = room // (CHUNK // 4), room // (CHUNK // 32)
+            staged = np.empty((LANES, longest + 2 * LANES), np.uint32)
+            near, indices = np.empty((3, most), np.float32), np.empty(most, np.uint32)
             cursor, limit = np.intp(chunk * room), np.intp((chunk + 1) * room)
+            before, candidates = (-1, -1, -1), np.intp(0)
             for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count), LANES):
-                place, width = np.intp(0), np.intp(0)
+                width = np.intp(0)
                 for i in range(first, min(first + LANES, count)):
-                    begin = place
-                    place = append_neighbors(
-                        i, columns, grid, square, staged, place, staged.shape[0]
-                    )
-                    if place < 0:
-                        break
-                    starts[i], ends[i] = begin, place
-                    width = max(width, place - begin)
-                if place < 0 or cursor + width * LANES > limit:
+                    cell = cell_of_particle(i, columns, grid)
+                    if cell != before:
+                        before = cell
+                        candidates = bring_together(cell, columns, grid, near, indices)
+                        if candidates < 0:
+                            width = longest + 1
+                            break
+                    x, y, z, length = xs[i], ys[i], zs[i], np.intp(0)
+                    for k in range(0, candidates, LANES):
+                        length = append_near(
+                            near[0], near[1], near[2], indices, k, x, y, z, square,
+                            staged[i - first], min(length, longest),
+                        )  # fmt: skip
+                    ends[i] = length
+                    width = max(width, length)
+                if width > longest or cursor + (width + LANES) * LANES > limit:
                     full[part] += 1
                     break
                 store_slice(first, staged, pairs, cursor, width)

@@ -101,6 +101,40 @@ def _load_compiled(typingctx, array, index):
     return signature(result, array, types.intp), generate
 
 
+@intrinsic
+def _turn_compiled(typingctx, rows, index, target, place):
+    def generate(context, builder, sig, args):
+        rows_, index_, target_, place_ = args
+        pointer = data_pointer(context, builder, sig.args[0], rows_)
+        width = _shape(context, builder, sig.args[0], rows_, 1)
+        vectors = []
+        for lane in range(LANES):
+            begin = builder.mul(width, ir.Constant(width.type, lane))
+            vectors.append(load_vector(builder, pointer, builder.add(begin, index_)))
+        # Halves, quarters, ... of pairs of vectors change places.
+        half = LANES // 2
+        while half:
+            low = [k + LANES - half if k & half else k for k in range(LANES)]
+            high = [k + LANES if k & half else k + half for k in range(LANES)]
+            for k in range(LANES):
+                if not k & half:
+                    a, b = vectors[k], vectors[k + half]
+                    vectors[k] = builder.shuffle_vector(a, b, ir.Constant(WHOLE, low))
+                    vectors[k + half] = builder.shuffle_vector(a, b, ir.Constant(WHOLE, high))
+            half //= 2
+        pointer = data_pointer(context, builder, sig.args[2], target_)
+        for k, vector in enumerate(vectors):
+            offset = ir.Constant(place_.type, LANES * k)
+            store_vector(builder, vector, pointer, builder.add(place_, offset))
+        return context.get_dummy_value()
+
+    return signature(types.void, rows, types.intp, target, types.intp), generate
+
+
+def _turn_plainly(rows, index, target, place):
+    target[place : place + LANES**2] = rows[:LANES, index : index + LANES].T.ravel()
+
+
 def _load_plainly(array, index):
     values = array[index : index + LANES]
     return values.astype(
@@ -327,6 +361,9 @@ def _put_plainly(vectors, array, row):
 load = _load_plainly if INTERPRETED else _load_compiled
 #: store(vector, array, index): the inverse; rounds for an int16 array.
 store = _store_plainly if INTERPRETED else _store_compiled
+#: turn(rows, index, target, place): write columns index ... index + 15 of a (16, K) array, numbers
+#: of 4 bytes, one after the other to target[place:place + 256].
+turn = _turn_plainly if INTERPRETED else _turn_compiled
 #: gather(array, indices): elements of a contiguous array, from any places; float32, int32, uint32.
 gather = _gather_plainly if INTERPRETED else _gather_compiled
 #: gather_points(array, indices): rows of an (N, 3) float32 array, from any places, as x, y, z. One

@@ -179,7 +179,7 @@ class Workspace:
         slots: most contacts of a particle.
         chunks: pieces of parallel work.
         predicted, starts, scratch, displacements, cohesive: (N, 3) float32.
-        columns: coordinates for the neighbour search, (3, N + LANES) float32.
+        columns: coordinates for the neighbour search, (3, N + 2 LANES) float32.
         cell_of, order: (N,) int32.
         diagonal, scaled, guesses, first, targets, residuals, yielded: of the pressure iterations,
             (N,) float32.
@@ -230,7 +230,7 @@ class Workspace:
             "squeezed": np.zeros(chunks, np.int64),
             "reactions": np.zeros((chunks, solids, 6), np.float64),
         }
-        self._columns = np.zeros(3 * (capacity + LANES), np.float32)
+        self._columns = np.zeros(3 * (capacity + 2 * LANES), np.float32)
         self._sums = Sums(
             np.ones(capacity, np.float32),
             np.ones(capacity, np.float32),
@@ -257,7 +257,8 @@ class Workspace:
             setattr(self, name, rows[:count])
         for name, rows in self._chunk_store.items():
             setattr(self, name, rows[: self.chunks])
-        self.columns = self._columns[: 3 * (count + LANES)].reshape(3, count + LANES)
+        width = count + 2 * LANES
+        self.columns = self._columns[: 3 * width].reshape(3, width)
         self.sums = Sums(*(rows[:count] for rows in self._sums))
         lists = {name: getattr(self._contacts, name)[:count] for name in _PER_PARTICLE}
         self.contacts = self._contacts._replace(**lists)
