@@ -48,7 +48,6 @@ def measure(spacing, solver, seconds):
 
     import sph_ros
 
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     simulation = sph_ros.Simulation(scene(spacing, solver))
     for _ in range(WARM_UP):
         simulation.step()
@@ -66,7 +65,7 @@ def measure(spacing, solver, seconds):
         compression.append(facts["mean_compression"])
         iterations += facts["iterations"]
     count = simulation.particle_count
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "solver": solver,
         "particles": count,
@@ -80,7 +79,7 @@ def measure(spacing, solver, seconds):
         "mean_compression": sum(compression) / len(compression),
         "worst_mean_compression": max(compression),
         "lost": simulation.statistics()["lost_particles"],
-        "kB_per_particle": 1024 * (after - before) / count,
+        "bytes_per_particle_beside_200_MB": max(memory - 200e6, 0.0) / count,
         "threads": numba.get_num_threads(),
     }
 

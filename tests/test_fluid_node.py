@@ -116,9 +116,12 @@ class FluidClient:
         request = GetParameters.Request(names=[name])
         return self.ros.call(GetParameters, "/fluid/get_parameters", request).values[0].double_value
 
-    def report(self, condition=lambda fluid, ball: True):
-        """Next diagnostics that meet a condition: (level, values) of the fluid and of the ball."""
-        start = len(self.reports)
+    def report(self, condition=lambda fluid, ball: True, start=None):
+        """Next diagnostics that meet a condition: (level, values) of the fluid and of the ball.
+
+        With `start`, those from that one on.
+        """
+        start = len(self.reports) if start is None else start
 
         def find():
             for array in self.reports[start:]:
@@ -375,9 +378,12 @@ def test_realtime_runs_by_itself_follows_the_hand_and_reports(realtime):
     seen = stamps(realtime)
     assert all(later > earlier for earlier, later in zip(seen, seen[1:], strict=False))
     goal = np.array([0.07, 0.06, 0.06])
+    before = len(realtime.reports)
     realtime.send(goal, 5.0)
     ball = lambda: cdr_to_markers(realtime.solids[-1])[1].position  # noqa: E731
     realtime.ros.wait_for(lambda: np.allclose(ball(), goal, atol=1e-6), what="for the ball")
+    felt = realtime.report(lambda fluid, ball: float(fluid["pose_latency_ms"]) > 0.0, before)
+    assert float(felt[1]["pose_latency_ms"]) < 6e4
     _, fluid, _, hand = realtime.report(lambda fluid, ball: float(fluid["step_time_ms"]) > 0.0)
     assert (fluid["state"], fluid["step_mode"]) == ("running", "realtime")
     assert 0.0 < float(fluid["real_time_factor"]) < 0.7  # speed is 0.5

@@ -5,6 +5,7 @@ Only the driver touches the simulation, so there is no lock that callbacks could
 else hands in orders (`order`) and functions (`call`), which run between two steps.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -38,6 +39,7 @@ class LockstepDriver:
         self.paused = False
         self.publish_period, self.surface_period = 1.0 / 30.0, 1.0 / 15.0
         self._count, self._due = 0, 0.0
+        self._latency = 0.0
 
     def start(self):
         """Nothing to start: callbacks drive."""
@@ -53,6 +55,13 @@ class LockstepDriver:
             self._due += self.publish_period
             self._take_steps()
         self._publish_state()
+        if order is not None:
+            self._latency = max(self._latency, time.monotonic() - order.arrival)
+
+    def take_latency(self):
+        """Longest time from a pose to the publication that showed it since the last call [s]."""
+        latency, self._latency = self._latency, 0.0
+        return latency
 
     def call(self, function):
         """Run `function` now; returns a finished Future."""
@@ -125,6 +134,7 @@ class ThreadDriver:
         self._changed, self._next_publish, self._next_surface = True, 0.0, 0.0
         self._last_publish = 0.0
         self._pace, self._pace_mark = 1.0, None
+        self._latency, self._felt = 0.0, math.inf
         self._thread = threading.Thread(target=self._run, name="stepping", daemon=True)
 
     def start(self):
@@ -147,6 +157,14 @@ class ThreadDriver:
         """
         if order is not None:
             self._orders[order.solid] = order
+
+    def take_latency(self):
+        """Longest time from a pose to the publication that showed it since the last call [s].
+
+        To be called in the thread. Poses that newer ones replaced do not count.
+        """
+        latency, self._latency = self._latency, 0.0
+        return latency
 
     def call(self, function):
         """Have `function` run between two steps; returns a concurrent.futures.Future."""
@@ -239,6 +257,7 @@ class ThreadDriver:
     def _apply_orders(self):
         while self._orders:
             _, order = self._orders.popitem()
+            self._felt = min(self._felt, order.arrival)
             # The solid needs as long as the hand did, in simulated time.
             self._runner.move(order, min(order.interval * self._pace, self.smoothing_time))
 
@@ -264,6 +283,9 @@ class ThreadDriver:
         # Surfaces go with a publication: the one that is nearest in time.
         surface_due = now >= self._next_surface - 0.5 * self.publish_period
         self._publish(self.stamp_ns(), surface_due)
+        if self._felt < math.inf:
+            self._latency = max(self._latency, time.monotonic() - self._felt)
+            self._felt = math.inf
         self._changed, self._last_publish = False, now
         self._next_publish = _following(moment, self.publish_period, now)
         if surface_due:

@@ -378,6 +378,7 @@ class FluidNode(Node):
             "mean_compression": statistics["mean_compression"],
             "max_compression": statistics["max_compression"],
             "max_speed": statistics["max_speed"],
+            "pose_latency_ms": 1e3 * driver.take_latency(),
             **{f"pose_age_{gate.solid}": gate.age for gate in self._gates},
         }
 

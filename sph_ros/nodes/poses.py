@@ -45,12 +45,14 @@ class Order(NamedTuple):
         position: [m], (3,).
         quat_xyzw: unit length, (4,).
         interval: usual time between poses [s], real time; 0 when unknown.
+        arrival: when it came, by the monotonic clock [s].
     """
 
     solid: str
     position: tuple
     quat_xyzw: tuple
     interval: float
+    arrival: float
 
 
 class PoseGate:
@@ -100,7 +102,7 @@ class PoseGate:
             raise
         self.accepted += 1
         self._note_arrival()
-        return Order(self.solid, position, quat_xyzw, self._interval)
+        return Order(self.solid, position, quat_xyzw, self._interval, self._arrival)
 
     def _read(self, buffer):
         try:
