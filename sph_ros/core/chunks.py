@@ -23,7 +23,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from sph_ros.core.jit import device, inlined
+from sph_ros.core.jit import called, device, inlined
 from sph_ros.core.vector import INTERPRETED, LANES
 from sph_ros.core.vector_memory import data_pointer
 
@@ -79,7 +79,7 @@ def fresh_turns():
     return np.zeros((PARTS, APART), np.int64)
 
 
-@inlined
+@called
 def next_chunk(turns, part, chunks):
     """The next chunk for who has a part; -1 if all have been begun.
 

@@ -106,7 +106,14 @@ kernel = _compiler(nogil=True)
 #: calls functions with many arrays.
 bare_kernel = _compiler(nogil=True, _nrt=False)
 
+#: What numba makes parallel: loops that say so, and nothing else. It need not look for more.
+LOOPS = {
+    "prange": True,
+    **dict.fromkeys(("comprehension", "reduction", "inplace_binop", "setitem", "numpy"), False),
+    **dict.fromkeys(("stencil", "fusion"), False),
+}
+
 #: A loop over arrays spread over threads. Iteration i of `prange` may write row i only. Give arrays
 #: that are fields of a tuple a local name before the loop: numba loses direct writes to them inside
 #: `prange`.
-parallel_kernel = _compiler(nogil=True, parallel=True)
+parallel_kernel = _compiler(nogil=True, parallel=LOOPS)

@@ -154,7 +154,7 @@ def iterate_pressures(
     displacements,
     errors,
 ):
-    """Iterate until the density is held, and displace by the pressures found.
+    """Iterate until the density is held; `pressure_displacements` then displaces by what was found.
 
     Jacobi corrections, projected to pressures that push, with Nesterov's extrapolation (Beck &
     Teboulle 2009), which starts over where it made the error larger (O'Donoghue & Candes 2015).
@@ -175,7 +175,7 @@ def iterate_pressures(
         pressures: scaled [m^2], (N,); a first guess, improved in place.
         guesses: the same, extrapolated, (N,); those that displacements are made by.
         first: the first guess, (N,).
-        displacements: [m], (N, 3); those by `pressures` at the end.
+        displacements: [m], (N, 3); written: those by the guesses of the last iteration.
         errors: (chunks,) float64; scratch.
     """
     count, chunks = pressures.shape[0], errors.shape[0]
@@ -231,13 +231,3 @@ def iterate_pressures(
             for i in range(count):
                 pressures[i] = guesses[i] = first[i]
         state[BEST] = min(state[BEST], error)
-    if state[DONE] > 0.0:
-        last = fresh_turns()
-        for part in prange(PARTS):
-            chunk = next_chunk(last, part, chunks)
-            while chunk >= 0:
-                for s in slices_of(chunk, pairs.stop.shape[0]):
-                    _displace(
-                        s * LANES, pairs, pressures, contact_gradients, cohesive, displacements
-                    )
-                chunk = next_chunk(last, part, chunks)

@@ -114,5 +114,8 @@ def solve_pressures(
             work.displacements,
             work.errors,
         )
+    core.pressure_displacements(
+        work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+    )
     share = min(GROW * float(state[core.SHARE]), most_share)
     return int(state[core.ITERATION]), float(state[core.ERROR]), share
