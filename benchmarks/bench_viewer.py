@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the viewer shows and what it costs the simulation: processes, a client as the browser.
 
-    python benchmarks/bench_viewer.py [--scene ball_tank_large] [--seconds 6] [--rounds 3]
+    python benchmarks/bench_viewer.py [--scene dam_break_large] [--speed 1] [--rounds 3]
 
-The node runs with `speed` so high that it never waits: whatever anybody takes from it shows. Loads
-follow each other again and again, because other programs' load on the machine changes more
-from minute to minute than the viewer costs: only factors of one round are compared. The client is a
-process that reads all that a browser would be sent, and counts. A slow one reads once a second.
-`others` is how many processors were busy with other programs: with more than a few tenths, the
-shares say how the system divides its processors among many rather than what the viewer costs.
+The node runs in real time, as it does for people; with `--speed 100` it never waits, and whatever
+anybody takes from it shows. Loads follow each other again and again, because other programs' load
+on the machine changes more from minute to minute than the viewer costs: only factors of one round
+are compared. The client is a process that reads all that a browser would be sent, and counts. A
+slow one reads once a second. `others` is how many processors were busy with other programs: with
+more than a few tenths, the shares say how the system divides its processors among many rather than
+what the viewer costs.
 """
 
 import argparse
@@ -249,10 +250,10 @@ def main():
         browse(int(sys.argv[2]), float(sys.argv[3]))
         return
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scene", default="ball_tank_large")
+    parser.add_argument("--scene", default="dam_break_large")
     parser.add_argument("--seconds", type=float, default=6.0, help="per load (6)")
     parser.add_argument("--rounds", type=int, default=3, help="of all loads (3)")
-    parser.add_argument("--speed", type=float, default=100.0, help="wanted; 100: never waits")
+    parser.add_argument("--speed", type=float, default=1.0, help="wanted (1); 100: never waits")
     parser.add_argument("--port", type=int, default=8099)
     parser.add_argument("--set", nargs="*", default=[], help="more parameters of the node: a:=b")
     options = parser.parse_args()

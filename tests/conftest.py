@@ -16,6 +16,10 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="sph_ros_log_"))
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+# Kernels that tests call themselves are compiled like all others, see `sim.kernels.OPTIMISATION`:
+# else the same formula in two of them may round differently. Read when numba is loaded.
+os.environ.setdefault("NUMBA_OPT", "1")
+
 # A shell starts background jobs deaf to Ctrl-C, which children inherit; tests press it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -39,6 +39,8 @@ def cloud(name, count=400, seed=0):
         points[:, 1] = 0.0
     if name == "dense":
         points *= 0.2
+    if name == "vast":  # nearly all are beyond the grid, in its last cell
+        points = generator.uniform(-1e4, 1e4, (4 * count, 3))
     if name == "single":
         points = points[:1]
     return points.astype(np.float32)
@@ -77,7 +79,7 @@ def neighbors_of(pairs, i):
     return pairs.neighbors[start:end:LANES]
 
 
-CLOUDS = ["uniform", "stray", "coincident", "planar", "dense", "single"]
+CLOUDS = ["uniform", "stray", "coincident", "planar", "dense", "vast", "single"]
 
 
 @pytest.mark.nojit

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.chunks import CHUNK
+from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.contacts import GRADIENT, NEAR_GRADIENT, SURFACE_VELOCITY, add_reaction
 from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of
@@ -106,34 +106,39 @@ def sum_densities(positions, velocities, support_radius, factors, pairs, state):
     ratio = -factors.colour_slope
     density, rate = state.density, state.rate
     pairs.unit[0] = -spiky_scale / STEPS
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        x, y, z = take_points(positions, first, 0)
-        vx, vy, vz = take_points(velocities, first, 0)
-        w, change = spread(zero), spread(zero)
-        for k in range(pairs.start[first], pairs.stop[s], LANES):
-            j = load(pairs.neighbors, k)
-            dx, dy, dz = gather_points(positions, j)
-            dx, dy, dz = x - dx, y - dy, z - dz
-            r2 = dx * dx + dy * dy + dz * dz + TINY
-            inverse_r = inverse_root(r2)
-            u = larger(one - inverse_h * (r2 * inverse_r), spread(zero))
-            factor = u * u * inverse_r
-            dx, dy, dz = factor * dx, factor * dy, factor * dz
-            store(STEPS * u, pairs.nearness, k)
-            store(STEPS * dx, pairs.x, k)
-            store(STEPS * dy, pairs.y, k)
-            store(STEPS * dz, pairs.z, k)
-            c = u * (two - u)
-            w += c * c * c
-            ux, uy, uz = gather_points(velocities, j)
-            along = dx * (vx - ux)
-            along += dy * (vy - uy)
-            along += dz * (vz - uz)
-            change += (one - u) * (two - u) * (two - u) * along
-        # Each entry that only fills the list has counted as the particle itself, with weight 1.
-        put(density_scale * (w - filling_of(pairs, first)), density, first)
-        put(ratio * change, rate, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                x, y, z = take_points(positions, first, 0)
+                vx, vy, vz = take_points(velocities, first, 0)
+                w, change = spread(zero), spread(zero)
+                for k in range(pairs.start[first], pairs.stop[s], LANES):
+                    j = load(pairs.neighbors, k)
+                    dx, dy, dz = gather_points(positions, j)
+                    dx, dy, dz = x - dx, y - dy, z - dz
+                    r2 = dx * dx + dy * dy + dz * dz + TINY
+                    inverse_r = inverse_root(r2)
+                    u = larger(one - inverse_h * (r2 * inverse_r), spread(zero))
+                    factor = u * u * inverse_r
+                    dx, dy, dz = factor * dx, factor * dy, factor * dz
+                    store(STEPS * u, pairs.nearness, k)
+                    store(STEPS * dx, pairs.x, k)
+                    store(STEPS * dy, pairs.y, k)
+                    store(STEPS * dz, pairs.z, k)
+                    c = u * (two - u)
+                    w += c * c * c
+                    ux, uy, uz = gather_points(velocities, j)
+                    along = dx * (vx - ux)
+                    along += dy * (vy - uy)
+                    along += dz * (vz - uz)
+                    change += (one - u) * (two - u) * (two - u) * along
+                # Entries that only fill lists have counted as the particle itself, with weight 1.
+                put(density_scale * (w - filling_of(pairs, first)), density, first)
+                put(ratio * change, rate, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
 
 
 @parallel_kernel
@@ -188,36 +193,41 @@ def pair_forces(pairs, velocities, factors, contact_gradients, state, accelerati
     lightness, walls = state.lightness, contact_gradients
     half_drag, push = np.float32(0.5) * factors.drag, factors.push
     zero, step = np.float32(0.0), np.float32(1.0) / STEPS
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        p, mu, own, unit = (
-            take(pressure, first),
-            take(viscosity, first),
-            take(volume, first),
-            pairs.unit[0],
-        )
-        vx, vy, vz = take_points(velocities, first, 0)
-        ax, ay, az = spread(zero), spread(zero), spread(zero)
-        for k in range(pairs.start[first], pairs.stop[s], LANES):
-            j = load(pairs.neighbors, k)
-            u = step * load(pairs.nearness, k)
-            x, y, z = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
-            dx, dy, dz = gather_points(velocities, j)
-            dx, dy, dz = vx - dx, vy - dy, vz - dz
-            along = smaller(dx * x + dy * y + dz * z, spread(zero))
-            approach = step * along / (u * u + np.float32(1e-6))
-            there = gather(volume, j)
-            both = p + gather(pressure, j) + factors.collision * approach * approach
-            both = (push * unit) * there * both
-            share = half_drag * there * (mu + gather(viscosity, j)) * u
-            ax -= both * x + share * dx
-            ay -= both * y + share * dy
-            az -= both * z + share * dz
-        wall = push * own * p
-        scale = own * take(lightness, first)
-        wx, wy, wz = take_points(walls, first, 3)
-        ax, ay, az = ax - wall * wx, ay - wall * wy, az - wall * wz
-        put((scale * ax, scale * ay, scale * az), accelerations, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                p, mu, own, unit = (
+                    take(pressure, first),
+                    take(viscosity, first),
+                    take(volume, first),
+                    pairs.unit[0],
+                )
+                vx, vy, vz = take_points(velocities, first, 0)
+                ax, ay, az = spread(zero), spread(zero), spread(zero)
+                for k in range(pairs.start[first], pairs.stop[s], LANES):
+                    j = load(pairs.neighbors, k)
+                    u = step * load(pairs.nearness, k)
+                    x, y, z = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+                    dx, dy, dz = gather_points(velocities, j)
+                    dx, dy, dz = vx - dx, vy - dy, vz - dz
+                    along = smaller(dx * x + dy * y + dz * z, spread(zero))
+                    approach = step * along / (u * u + np.float32(1e-6))
+                    there = gather(volume, j)
+                    both = p + gather(pressure, j) + factors.collision * approach * approach
+                    both = (push * unit) * there * both
+                    share = half_drag * there * (mu + gather(viscosity, j)) * u
+                    ax -= both * x + share * dx
+                    ay -= both * y + share * dy
+                    az -= both * z + share * dz
+                wall = push * own * p
+                scale = own * take(lightness, first)
+                wx, wy, wz = take_points(walls, first, 3)
+                ax, ay, az = ax - wall * wx, ay - wall * wy, az - wall * wz
+                put((scale * ax, scale * ay, scale * az), accelerations, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
 
 
 @parallel_kernel

@@ -115,5 +115,5 @@ LOOPS = {
 
 #: A loop over arrays spread over threads. Iteration i of `prange` may write row i only. Give arrays
 #: that are fields of a tuple a local name before the loop: numba loses direct writes to them inside
-#: `prange`.
+#: `prange`. What takes long in every step is shared out by `core.chunks`.
 parallel_kernel = _compiler(nogil=True, parallel=LOOPS)

@@ -219,9 +219,8 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
     for part in prange(PARTS):
         chunk = next_chunk(turns, part, chunks)
         while chunk >= 0:
-            # Room for lists four times as long as the mean one, and for as many candidates as in a
-            # liquid eight times as dense as at rest.
-            longest, most = room // (CHUNK // 4), room // (CHUNK // 32)
+            # Room for lists four times as long as the mean one.
+            longest, most = room // (CHUNK // 4), 1000
             staged = np.empty((LANES, longest + 2 * LANES), np.uint32)
             near, indices = np.empty((3, most), np.float32), np.empty(most, np.uint32)
             cursor, limit = np.intp(chunk * room), np.intp((chunk + 1) * room)
@@ -233,9 +232,13 @@ def find_neighbors(columns, grid, support_radius, chunks, pairs):
                     if cell != before:
                         before = cell
                         candidates = bring_together(cell, columns, grid, near, indices)
-                        if candidates < 0:
-                            width = longest + 1
-                            break
+                        while candidates < 0:
+                            most *= 2
+                            near, indices = (
+                                np.empty((3, most), np.float32),
+                                np.empty(most, np.uint32),
+                            )
+                            candidates = bring_together(cell, columns, grid, near, indices)
                     x, y, z, length = xs[i], ys[i], zs[i], np.intp(0)
                     for k in range(0, candidates, LANES):
                         length = append_near(

@@ -22,6 +22,7 @@ of the liquid's rotation on itself, -n_i in p_i, and so may feed energy.)
 import numpy as np
 from numba import prange
 
+from sph_ros.core.chunks import PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.vector import LANES, larger, smaller, spread
 from sph_ros.core.vector_memory import gather_points, load, put, take, take_points
@@ -120,25 +121,30 @@ def rub_spins(
     one = np.float32(1.0)
     gradients, squares = sums.gradient, sums.gradient_square
     least = NOTHING * determinant
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        matrix = matrix_of_pairs(pairs, positions, first)
-        x, y, z = turning_of_pairs(pairs, velocities, first)
-        x, y, z, found = solved(matrix, least, x, y, z)
-        known = smaller(found / determinant, spread(one))
-        gx, gy, gz = take_points(gradients, first, 0)
-        uneven = (take(squares, first) + gx * gx + gy * gy + gz * gz) / square
-        known *= known / larger(uneven * uneven, spread(one))
-        if new:
-            put((known * x, known * y, known * z), spins, first)
-        strength = exchange * known
-        share = strength / (square_radius + strength)
-        wx, wy, wz = take_points(spins, first, 0)
-        x, y, z = wx - x, wy - y, wz - z
-        put((wx - share * x, wy - share * y, wz - share * z), spins, first)
-        strength *= one - share
-        x, y, z, _ = solved(matrix, least, x, y, z)
-        put((strength * x, strength * y, strength * z), pushes, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                matrix = matrix_of_pairs(pairs, positions, first)
+                x, y, z = turning_of_pairs(pairs, velocities, first)
+                x, y, z, found = solved(matrix, least, x, y, z)
+                known = smaller(found / determinant, spread(one))
+                gx, gy, gz = take_points(gradients, first, 0)
+                uneven = (take(squares, first) + gx * gx + gy * gy + gz * gz) / square
+                known *= known / larger(uneven * uneven, spread(one))
+                if new:
+                    put((known * x, known * y, known * z), spins, first)
+                strength = exchange * known
+                share = strength / (square_radius + strength)
+                wx, wy, wz = take_points(spins, first, 0)
+                x, y, z = wx - x, wy - y, wz - z
+                put((wx - share * x, wy - share * y, wz - share * z), spins, first)
+                strength *= one - share
+                x, y, z, _ = solved(matrix, least, x, y, z)
+                put((strength * x, strength * y, strength * z), pushes, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
 
 
 @parallel_kernel
@@ -151,18 +157,23 @@ def push_by_spins(pairs, pushes, velocities):
         velocities: [m/s], (N, 3); changed.
     """
     zero = np.float32(0.0)
-    for s in prange(pairs.stop.shape[0]):
-        first = s * LANES
-        x, y, z = spread(zero), spread(zero), spread(zero)
-        px, py, pz = take_points(pushes, first, 0)
-        for k in range(pairs.start[first], pairs.stop[s], LANES):
-            j = load(pairs.neighbors, k)
-            gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
-            a, b, c = gather_points(pushes, j)
-            a, b, c = px + a, py + b, pz + c
-            x += b * gz - c * gy
-            y += c * gx - a * gz
-            z += a * gy - b * gx
-        unit = pairs.unit[0]
-        vx, vy, vz = take_points(velocities, first, 0)
-        put((vx - unit * x, vy - unit * y, vz - unit * z), velocities, first)
+    turns = fresh_turns()
+    for part in prange(PARTS):
+        chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))
+        while chunk >= 0:
+            for s in slices_of(chunk, pairs.stop.shape[0]):
+                first = s * LANES
+                x, y, z = spread(zero), spread(zero), spread(zero)
+                px, py, pz = take_points(pushes, first, 0)
+                for k in range(pairs.start[first], pairs.stop[s], LANES):
+                    j = load(pairs.neighbors, k)
+                    gx, gy, gz = load(pairs.x, k), load(pairs.y, k), load(pairs.z, k)
+                    a, b, c = gather_points(pushes, j)
+                    a, b, c = px + a, py + b, pz + c
+                    x += b * gz - c * gy
+                    y += c * gx - a * gz
+                    z += a * gy - b * gx
+                unit = pairs.unit[0]
+                vx, vy, vz = take_points(velocities, first, 0)
+                put((vx - unit * x, vy - unit * y, vz - unit * z), velocities, first)
+            chunk = next_chunk(turns, part, chunk_count(velocities.shape[0]))

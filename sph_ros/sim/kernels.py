@@ -29,6 +29,10 @@ COMPILING = "SPH_ROS_COMPILING"
 
 LONGEST = 900.0  # [s]
 
+#: LLVM's level. What takes time is written in vectors (`core.vector`): higher levels make steps 3 %
+#: shorter at best, and the first start a quarter longer.
+OPTIMISATION = "1"
+
 #: What scenes may have beside a solver; each has kernels of its own.
 FEATURES = ("bodies", "sheets", "meshes", "springs", "spins", "thick", "tension")
 
@@ -225,12 +229,10 @@ def _start_child(names):
     paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
     return subprocess.Popen(
         [sys.executable, "-m", "sph_ros.sim.kernels", *names],
-        # What takes time is written in vectors (`core.vector`): LLVM's higher levels make steps 3 %
-        # shorter at best, and the first start a quarter longer.
         env={
             **os.environ,
             COMPILING: "1",
-            "NUMBA_OPT": "1",
+            "NUMBA_OPT": OPTIMISATION,
             "PYTHONPATH": os.pathsep.join(paths),
         },
         stdin=subprocess.DEVNULL,
