@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
-from sph_ros.core.jit import device, inlined, kernel, parallel_kernel
+from sph_ros.core.jit import device, inlined, parallel_kernel
 from sph_ros.core.near_points import append_near
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
 from sph_ros.core.vector import LANES, inverse_root, larger, spread
@@ -74,7 +74,7 @@ def cell_coordinate(value, lower, inverse_cell, count):
     return min(max(cell, 0), count - 1)
 
 
-@kernel
+@parallel_kernel
 def sort_by_cell(positions, grid, cell_of, order):
     """Stable counting sort of particles by cell.
 
@@ -89,15 +89,15 @@ def sort_by_cell(positions, grid, cell_of, order):
     a, b, c = grid.axes[0], grid.axes[1], grid.axes[2]
     cell_start, count = grid.cell_start, positions.shape[0]
     cells = nx * ny * nz
-    for cell in range(cells):
-        cell_start[cell] = 0
-    for i in range(count):
+    for i in prange(count):
         cx = cell_coordinate(positions[i, a], grid.lower[0], grid.inverse_cell, nx)
         cy = cell_coordinate(positions[i, b], grid.lower[1], grid.inverse_cell, ny)
         cz = cell_coordinate(positions[i, c], grid.lower[2], grid.inverse_cell, nz)
-        cell = (cz * ny + cy) * nx + cx
-        cell_of[i] = cell
-        cell_start[cell] += 1
+        cell_of[i] = (cz * ny + cy) * nx + cx
+    for cell in range(cells):
+        cell_start[cell] = 0
+    for i in range(count):
+        cell_start[cell_of[i]] += 1
     # First the end of each cell, which then moves down to its start.
     end = 0
     for cell in range(cells):
