@@ -52,7 +52,7 @@ def measure(name):
         simulation.step()
         wall += time.perf_counter() - begin
         for part in PARTS:
-            parts[part] += simulation.timings[part] / steps
+            parts[part] += simulation.timings.get(part, 0.0) / steps
         iterations += simulation._solver.iterations / steps
     facts = simulation.statistics()
     worst = facts["mean_compression"]
