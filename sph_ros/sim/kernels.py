@@ -29,8 +29,8 @@ COMPILING = "SPH_ROS_COMPILING"
 
 LONGEST = 900.0  # [s]
 
-#: LLVM's level. What takes time is written in vectors (`core.vector`): higher levels make steps 3 %
-#: shorter at best, and the first start a quarter longer.
+#: LLVM's level. What takes time is written in vectors (`core.vector`): six pairs of runs at level 3
+#: differed by 1 % at one thread, and by less than the noise at two, but start some seconds later.
 OPTIMISATION = "1"
 
 #: What scenes may have beside a solver; each has kernels of its own.
