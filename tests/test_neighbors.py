@@ -117,7 +117,7 @@ def iterated(points, power=2):
     pressure.pressure_displacements(
         work.pairs,
         guess,
-        work.contacts.gradients,
+        work.contacts,
         work.cohesive,
         work.displacements,
     )
@@ -154,7 +154,7 @@ def corrected(work, guess, residuals):
         work.pairs,
         work.targets,
         residuals,
-        work.contacts.gradients,
+        work.contacts,
         work.cohesive,
         work.yielded,
         work.diagonal,

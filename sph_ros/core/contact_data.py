@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sph_ros.core.jit import inlined
+from sph_ros.core.vector import LANES, spread
+from sph_ros.core.vector_memory import take_points
 
 #: Columns of `Contacts.terms`.
 FRACTION, NEAR_FRACTION, GRADIENT, NEAR_GRADIENT, NORMAL, SURFACE_VELOCITY = 0, 1, 2, 5, 8, 11
@@ -37,6 +39,7 @@ class Contacts(NamedTuple):
             share and are [1/m], the surface's velocity [m/s], its distance [m], (K, TERMS) float32.
         density: density and near-density that all solids add to particle i [-], (N, 2).
         gradients: sums of the gradients over the contacts [1/m], (N, 6).
+        touching: whether any of sixteen particles has a contact, (ceil(N / LANES),) uint8.
     """
 
     start: np.ndarray
@@ -45,6 +48,21 @@ class Contacts(NamedTuple):
     terms: np.ndarray
     density: np.ndarray
     gradients: np.ndarray
+    touching: np.ndarray
+
+
+@inlined
+def wall_gradients(contacts, first):
+    """Gradients of the density that walls add to a slice, x, y, z; read only where there are any.
+
+    Args:
+        contacts: from `find_contacts`.
+        first: particle of the slice.
+    """
+    if contacts.touching[first // LANES]:
+        return take_points(contacts.gradients, first, 0)
+    nothing = spread(np.float32(0.0))
+    return nothing, nothing, nothing
 
 
 @inlined

@@ -8,7 +8,7 @@ rule of `walls`: the liquid's share of the support is the product of what each s
 import numpy as np
 from numba import prange
 
-from sph_ros.core.chunks import CHUNK, PARTS, fresh_turns, next_chunk
+from sph_ros.core.chunks import CHUNK, PARTS, fresh_turns, next_chunk, slices_of
 from sph_ros.core.contact_data import (
     DISTANCE,
     FRACTION,
@@ -30,6 +30,7 @@ from sph_ros.core.distances import normal_called, signed_distance
 from sph_ros.core.jit import called, inlined, parallel_kernel
 from sph_ros.core.sheet_contacts import add_sheet_contacts
 from sph_ros.core.thin_films import add_film_walls, add_films
+from sph_ros.core.vector import LANES
 from sph_ros.core.walls import wall_terms
 
 __all__ = ["TERMS", "Contacts", "Motion"]
@@ -98,6 +99,8 @@ def find_contacts_of_chunk(
         reach = shapes.support_radius
     for s in range(solids):
         reach = max(reach, shapes.reach[s])
+    for s in slices_of(chunk, contacts.touching.shape[0]):
+        contacts.touching[s] = False
     for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, positions.shape[0])):
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         contacts.start[i] = bodies = cursor
@@ -124,6 +127,8 @@ def find_contacts_of_chunk(
                 cursor += rows
             clearance[i] = nearest
         contacts.end[i] = cursor
+        if contacts.start[i] < cursor:
+            contacts.touching[i // LANES] = True
         combine_contacts(contacts, packing, i, contacts.start[i], cursor)
         if contacts.start[i] + 1 < bodies:
             add_films(contacts, shapes, packing, i, contacts.start[i], bodies)

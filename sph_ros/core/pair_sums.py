@@ -13,7 +13,7 @@ import numpy as np
 
 from sph_ros.core.jit import inlined
 from sph_ros.core.vector import LANES, as_floats, inverse_root, larger, root, smaller, spread
-from sph_ros.core.vector_memory import gather, gather_points, load, store, take, take_points
+from sph_ros.core.vector_memory import gather, gather_points, load, prefetch, store, take, take_points
 
 #: Gradients and nearness are kept as whole multiples of 1 / `STEPS` of the largest.
 STEPS = np.float32(32767.0)
@@ -21,6 +21,11 @@ STEPS = np.float32(32767.0)
 #: Added to the squared distance of each pair [m^2], so that a particle may be its own neighbour:
 #: 0 / tiny is 0.
 TINY = np.float32(1e-20)
+
+#: Entries of lists for which there is no room in the processor's last cache (10 bytes each), about;
+#: and how far ahead those are asked for: what comes from memory takes longest of all, and the
+#: processor does not see by itself that it goes on behind the other readings.
+FAR, AHEAD = 2_500_000, 2048
 
 
 class Pairs(NamedTuple):
@@ -61,6 +66,22 @@ def filling_of(pairs, first):
 
 
 @inlined
+def are_far(pairs):
+    """Whether the lists are too long for the caches."""
+    return pairs.neighbors.shape[0] > FAR
+
+
+@inlined
+def expect(pairs, k, far):
+    """Let the processor ask for entries behind those at k, if they are far."""
+    if far:
+        prefetch(pairs.neighbors, k + AHEAD)
+        prefetch(pairs.x, k + AHEAD)
+        prefetch(pairs.y, k + AHEAD)
+        prefetch(pairs.z, k + AHEAD)
+
+
+@inlined
 def push_by_pairs(pairs, values, first):
     """Sum of (a_i + a_j) g_ij over the neighbours j of each particle i of a slice.
 
@@ -72,9 +93,10 @@ def push_by_pairs(pairs, values, first):
     Returns:
         a of the slice; x, y, z of the sums.
     """
-    own = take(values, first)
+    own, far = take(values, first), are_far(pairs)
     x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        expect(pairs, k, far)
         both = own + gather(values, load(pairs.neighbors, k))
         x += both * load(pairs.x, k)
         y += both * load(pairs.y, k)
@@ -93,8 +115,9 @@ def divergence_of_pairs(pairs, displacements, first):
         first: particle of the slice.
     """
     x, y, z = take_points(displacements, first, 0)
-    change = spread(np.float32(0.0))
+    change, far = spread(np.float32(0.0)), are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        expect(pairs, k, far)
         there_x, there_y, there_z = gather_points(displacements, load(pairs.neighbors, k))
         change += load(pairs.x, k) * (x - there_x)
         change += load(pairs.y, k) * (y - there_y)
@@ -157,8 +180,9 @@ def weights_after(pairs, positions, displacements, first, support_radius, bend):
     inverse_h = one / support_radius
     x, y, z = take_points(positions, first, 0)
     ux, uy, uz = take_points(displacements, first, 0)
-    weights, linear = spread(zero), spread(zero)
+    weights, linear, far = spread(zero), spread(zero), are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        expect(pairs, k, far)
         j = load(pairs.neighbors, k)
         mx, my, mz = gather_points(displacements, j)
         mx, my, mz = ux - mx, uy - my, uz - mz

@@ -11,6 +11,7 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
+from sph_ros.core.contact_data import wall_gradients
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.pair_sums import divergence_of_pairs, push_by_pairs
 from sph_ros.core.vector import LANES, larger, magnitude, spread, total, where
@@ -61,35 +62,35 @@ def scale_guess(pressures, unit, scaled, guesses, first):
 
 
 @parallel_kernel
-def pressure_diagonal(sums, contact_gradients, compliance, diagonal):
+def pressure_diagonal(sums, contacts, compliance, diagonal):
     """How much a particle's own scaled pressure lowers its own density [1/m^2].
 
     Args:
         sums: from `sum_densities`.
-        contact_gradients: gradients of the density and the near-density that walls add [1/m], (N,
-            6).
+        contacts: of the particles with the solids.
         compliance: density per scaled pressure that the liquid itself yields [1/m^2], float32.
         diagonal: (N,); written.
     """
+    gradients = contacts.gradients
     for i in prange(diagonal.shape[0]):
         own = sums.gradient_square[i] + compliance
         for axis in range(3):
-            total = sums.gradient[i, axis] + contact_gradients[i, axis]
+            total = sums.gradient[i, axis] + gradients[i, axis]
             own += total * total
         diagonal[i] = max(own, compliance + np.float32(1e-12))
 
 
 @inlined
-def _displace(first, pairs, pressures, contact_gradients, cohesive, displacements):
+def _displace(first, pairs, pressures, contacts, cohesive, displacements):
     """What `pressure_displacements` does, for the slice that begins at particle `first`."""
     own, x, y, z = push_by_pairs(pairs, pressures, first)
-    gx, gy, gz = take_points(contact_gradients, first, 0)
+    gx, gy, gz = wall_gradients(contacts, first)
     cx, cy, cz = take_points(cohesive, first, 0)
     put((cx - x - own * gx, cy - y - own * gy, cz - z - own * gz), displacements, first)
 
 
 @parallel_kernel
-def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displacements):
+def pressure_displacements(pairs, pressures, contacts, cohesive, displacements):
     """Displacements by given pressures (Clavet 2005, Alg. 2, gathered).
 
     Each particle gathers from its neighbours. The two sides of a pair are the same numbers with
@@ -98,7 +99,7 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
     Args:
         pairs: from `sum_densities`.
         pressures: times dt^2 / (rho0 virial) [m^2], (N,).
-        contact_gradients: as in `pressure_diagonal`.
+        contacts: as in `pressure_diagonal`.
         cohesive: displacements to start from [m], (N, 3).
         displacements: [m], (N, 3); written.
     """
@@ -107,16 +108,16 @@ def pressure_displacements(pairs, pressures, contact_gradients, cohesive, displa
         chunk = next_chunk(turns, part, chunk_count(pressures.shape[0]))
         while chunk >= 0:
             for s in slices_of(chunk, pairs.stop.shape[0]):
-                _displace(s * LANES, pairs, pressures, contact_gradients, cohesive, displacements)
+                _displace(s * LANES, pairs, pressures, contacts, cohesive, displacements)
             chunk = next_chunk(turns, part, chunk_count(pressures.shape[0]))
 
 
 @inlined
-def _density_change(first, pairs, contact_gradients, displacements):
+def _density_change(first, pairs, contacts, displacements):
     """How much denser a slice gets [-]."""
     change = divergence_of_pairs(pairs, displacements, first)
     x, y, z = take_points(displacements, first, 0)
-    gx, gy, gz = take_points(contact_gradients, first, 0)
+    gx, gy, gz = wall_gradients(contacts, first)
     return change + gx * x + gy * y + gz * z
 
 
@@ -140,7 +141,7 @@ def iterate_pressures(
     pairs,
     densities,
     residuals,
-    contact_gradients,
+    contacts,
     cohesive,
     yielded,
     diagonal,
@@ -164,7 +165,7 @@ def iterate_pressures(
         densities: at the displacements zero, relative to rest [-], (N,).
         residuals: their errors at the displacements by the first guess, free bodies and compliance
             left out [-], (N,); or (0,): to be found.
-        contact_gradients: as in `pressure_diagonal`.
+        contacts: as in `pressure_diagonal`.
         cohesive: displacements to start from [m], (N, 3).
         yielded: how much the density sinks because free bodies give way to the guesses [-], (N,).
         diagonal: from `pressure_diagonal`.
@@ -188,9 +189,7 @@ def iterate_pressures(
                 chunk = next_chunk(turns, part, chunks)
                 while chunk >= 0:
                     for s in slices_of(chunk, pairs.stop.shape[0]):
-                        _displace(
-                            s * LANES, pairs, guesses, contact_gradients, cohesive, displacements
-                        )
+                        _displace(s * LANES, pairs, guesses, contacts, cohesive, displacements)
                     chunk = next_chunk(turns, part, chunks)
         inertia = state[INERTIA]
         grown = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * inertia * inertia))
@@ -205,7 +204,7 @@ def iterate_pressures(
                         residual = take(residuals, row)
                     else:
                         residual = take(densities, row) - np.float32(1.0)
-                        residual += _density_change(row, pairs, contact_gradients, displacements)
+                        residual += _density_change(row, pairs, contacts, displacements)
                     error += _correct(
                         row, residual, yielded, compliance, diagonal, share, momentum, pressures,
                         guesses,

@@ -18,11 +18,12 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
-from sph_ros.core.contacts import (
+from sph_ros.core.contact_data import (
     GRADIENT,
     SURFACE_VELOCITY,
     to_solid,
     to_world,
+    wall_gradients,
 )
 from sph_ros.core.jit import inlined, parallel_kernel
 from sph_ros.core.pair_sums import weights_after
@@ -148,7 +149,6 @@ def density_targets(
     one = np.float32(1.0)
     bend = power - np.float32(2.0)
     count, walls = targets.shape[0], contacts.density
-    gradients = contacts.gradients
     turns = fresh_turns()
     for part in prange(PARTS):
         chunk = next_chunk(turns, part, chunk_count(count))
@@ -167,7 +167,7 @@ def density_targets(
                 wanted += density_scale * weights - (now - wall)
                 put(wanted - linear + one, targets, first)
                 x, y, z = take_points(displacements, first, 0)
-                gx, gy, gz = take_points(gradients, first, 0)
+                gx, gy, gz = wall_gradients(contacts, first)
                 put(wanted + gx * x + gy * y + gz * z, residuals, first)
                 for i in range(first, min(first + LANES, count)):
                     for k in range(contacts.start[i], contacts.end[i]):

@@ -6,7 +6,7 @@ as far as there are so many.
 
 Three numbers of a row are read at once (`gather_points`) and sixteen such readings transposed in
 registers, which takes a third of what three gathers take. Four numbers are read for that, so
-behind the last one of an array one more must be readable: see `sim.state.padded`.
+behind the last one of an array one more must be readable: see `sim.state.allocate`.
 """
 
 import numpy as np
@@ -133,6 +133,26 @@ def _turn_compiled(typingctx, rows, index, target, place):
 
 def _turn_plainly(rows, index, target, place):
     target[place : place + LANES**2] = rows[:LANES, index : index + LANES].T.ravel()
+
+
+@intrinsic
+def _prefetch_compiled(typingctx, array, index):
+    def generate(context, builder, sig, args):
+        place = data_pointer(context, builder, sig.args[0], args[0])
+        place = builder.bitcast(builder.gep(place, [args[1]]), ir.IntType(8).as_pointer())
+        kinds = [place.type, INT32, INT32, INT32]
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), kinds), "llvm.prefetch.p0i8"
+        )
+        read, into_second_cache, data = (ir.Constant(INT32, value) for value in (0, 2, 1))
+        builder.call(function, [place, read, into_second_cache, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
+def _prefetch_plainly(array, index):
+    pass
 
 
 def _load_plainly(array, index):
@@ -361,6 +381,8 @@ def _put_plainly(vectors, array, row):
 load = _load_plainly if INTERPRETED else _load_compiled
 #: store(vector, array, index): the inverse; rounds for an int16 array.
 store = _store_plainly if INTERPRETED else _store_compiled
+#: prefetch(array, index): let the processor begin to read what is there, or would be.
+prefetch = _prefetch_plainly if INTERPRETED else _prefetch_compiled
 #: turn(rows, index, target, place): write columns index ... index + 15 of a (16, K) array, numbers
 #: of 4 bytes, one after the other to target[place:place + 256].
 turn = _turn_plainly if INTERPRETED else _turn_compiled

@@ -232,7 +232,7 @@ class IncompressibleSolver(PressureSolver):
         core.pressure_displacements(
             work.pairs,
             work.scaled,
-            work.contacts.gradients,
+            work.contacts,
             work.cohesive,
             work.starts,
         )
@@ -258,7 +258,7 @@ class IncompressibleSolver(PressureSolver):
         core.pressure_displacements(
             work.pairs,
             work.scaled,
-            work.contacts.gradients,
+            work.contacts,
             work.cohesive,
             work.displacements,
         )

@@ -66,7 +66,6 @@ def jacobi_share(support_radius, spacing, dimension, power):
 def solve_pressures(
     work,
     densities,
-    gradients,
     compliance,
     goal,
     share,
@@ -77,10 +76,9 @@ def solve_pressures(
     """Scaled pressures that hold the density, and the displacements they cause.
 
     Args:
-        work: `Workspace` with pairs, diagonal, the displacements without pressure in `cohesive`
+        work: `Workspace` with pairs, contacts, diagonal, the displacements without pressure in `cohesive`
             and a first guess by `scale_guess`; `scaled` and `displacements` are written.
         densities: without displacement, relative to rest [-], (N,).
-        gradients: of the contacts, (N, 6).
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.
         share, most_share: of the Jacobi correction to take now, and when all is well.
@@ -100,7 +98,7 @@ def solve_pressures(
             work.pairs,
             densities,
             residuals,
-            gradients,
+            work.contacts,
             work.cohesive,
             work.yielded,
             work.diagonal,
@@ -115,7 +113,7 @@ def solve_pressures(
             work.errors,
         )
     core.pressure_displacements(
-        work.pairs, work.scaled, gradients, work.cohesive, work.displacements
+        work.pairs, work.scaled, work.contacts, work.cohesive, work.displacements
     )
     share = min(GROW * float(state[core.SHARE]), most_share)
     return int(state[core.ITERATION]), float(state[core.ERROR]), share

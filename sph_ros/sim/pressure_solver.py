@@ -160,14 +160,12 @@ class PressureSolver(Solver):
         See `solve_pressures`. Free bodies must have had all pushes but this.
         """
         work = self._work
-        gradients = work.contacts.gradients
-        core.pressure_diagonal(work.sums, gradients, compliance, work.diagonal)
+        core.pressure_diagonal(work.sums, work.contacts, compliance, work.diagonal)
         if self._coupling is not None:
             self._coupling.add_diagonal(work.diagonal)
         self.iterations, self.density_error, self._share = solve_pressures(
             work,
             densities,
-            gradients,
             compliance,
             goal,
             self._share,

@@ -61,9 +61,7 @@ class Fluid:
         """Start with particles in public order."""
         count = len(positions)
         self.capacity = max(capacity, count)
-        self._store, self._spare = (
-            {name: padded(self.capacity, *row) for name, row in self.ROWS.items()} for _ in range(2)
-        )
+        self._store, self._spare = (allocate(self.capacity, self.ROWS) for _ in range(2))
         self._store["ids"] = np.zeros(self.capacity, np.uint32)
         self._resize(count)
         self.positions[:] = np.reshape(positions, (count, 3))
@@ -210,6 +208,20 @@ class Workspace:
         "scales": (0, np.float32),
     }
 
+    #: The same of `Sums` and `Contacts`.
+    SUMS = {
+        "density": (0, np.float32),
+        "near_density": (0, np.float32),
+        "gradient": (3, np.float32),
+        "gradient_square": (0, np.float32),
+    }
+    CONTACTS = {
+        "start": (0, np.int32),
+        "end": (0, np.int32),
+        "density": (2, np.float32),
+        "gradients": (6, np.float32),
+    }
+
     def __init__(self, capacity, solids, slots=None, pairs_per_particle=40):
         """Allocate for `capacity` particles, all of which are there.
 
@@ -222,7 +234,7 @@ class Workspace:
         self.capacity = capacity
         self.slots = solids if slots is None else slots
         chunks = max(chunk_count(capacity), 1)
-        self._store = {name: padded(capacity, *row) for name, row in self.ROWS.items()}
+        self._store = allocate(capacity, self.ROWS)
         self._chunk_store = {
             "errors": np.zeros(chunks, np.float64),
             "strongest": np.zeros(chunks, np.float64),
@@ -231,20 +243,14 @@ class Workspace:
             "reactions": np.zeros((chunks, solids, 6), np.float64),
         }
         self._columns = np.zeros(3 * (capacity + 2 * LANES), np.float32)
-        self._sums = Sums(
-            np.ones(capacity, np.float32),
-            np.ones(capacity, np.float32),
-            padded(capacity, 3),
-            np.empty(capacity, np.float32),
-        )
+        self._sums = Sums(**allocate(capacity, self.SUMS))
+        self._sums.density[:] = self._sums.near_density[:] = 1.0
         room = chunks * CHUNK * self.slots
         self._contacts = Contacts(
-            np.zeros(capacity, np.int32),
-            np.zeros(capacity, np.int32),
-            np.empty(room, np.int32),
-            np.empty((room, TERMS), np.float32),
-            np.zeros((capacity, 2), np.float32),
-            padded(capacity, 6),
+            **allocate(capacity, self.CONTACTS),
+            solid=np.empty(room, np.int32),
+            terms=np.empty((room, TERMS), np.float32),
+            touching=np.zeros(-(-capacity // LANES), np.uint8),
         )
         self._allocate_pairs(pairs_per_particle)
         self.fit(capacity)
@@ -260,8 +266,11 @@ class Workspace:
         width = count + 2 * LANES
         self.columns = self._columns[: 3 * width].reshape(3, width)
         self.sums = Sums(*(rows[:count] for rows in self._sums))
-        lists = {name: getattr(self._contacts, name)[:count] for name in _PER_PARTICLE}
-        self.contacts = self._contacts._replace(**lists)
+        lists = {name: getattr(self._contacts, name)[:count] for name in self.CONTACTS}
+        slices = -(-count // LANES)
+        self.contacts = self._contacts._replace(
+            **lists, touching=self._contacts.touching[:slices]
+        )
         self._fit_pairs()
 
     def _allocate_pairs(self, per_particle):
@@ -289,16 +298,30 @@ class Workspace:
         self._fit_pairs()
 
 
-#: Fields of `Contacts` with a row per particle.
-_PER_PARTICLE = ("start", "end", "density", "gradients")
+def allocate(count, rows):
+    """Arrays of zeros with `count` rows, one behind the other in one piece of memory.
 
+    A piece of some megabytes consists of huge pages where the system has any, which numpy asks for;
+    many small arrays would need more pages than a processor keeps at hand. Behind the last row of
+    each there is room for one more: `core.vector_memory.gather_points` may read beyond it.
 
-def padded(count, columns, kind=np.float32):
-    """Rows of zeros, numbers where `columns` is 0, behind which there is room for one more.
+    Args:
+        count: rows.
+        rows: name -> columns (0: a plain number), type of 4 bytes.
 
-    `core.vector_memory.gather_points` may read beyond the last row.
+    Returns:
+        name -> array.
     """
-    return np.zeros((count + 1, columns) if columns else count + 1, kind)[:count]
+    widths = [-(-4 * (count + 1) * max(columns, 1) // CACHE_LINE) for columns, _ in rows.values()]
+    memory = aligned(CACHE_LINE * sum(widths), np.uint8)
+    memory[:] = 0
+    pieces = np.split(memory, CACHE_LINE * np.cumsum(widths)[:-1])
+    return {
+        name: piece.view(kind)[: count * max(columns, 1)].reshape(
+            (count, columns) if columns else count
+        )
+        for piece, (name, (columns, kind)) in zip(pieces, rows.items(), strict=True)
+    }
 
 
 def aligned(count, kind):
