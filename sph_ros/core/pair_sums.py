@@ -12,8 +12,25 @@ from typing import NamedTuple
 import numpy as np
 
 from sph_ros.core.jit import inlined
-from sph_ros.core.vector import LANES, as_floats, inverse_root, larger, root, smaller, spread
-from sph_ros.core.vector_memory import gather, gather_points, load, prefetch, store, take, take_points
+from sph_ros.core.vector import (
+    LANES,
+    LAST_CACHE,
+    as_floats,
+    inverse_root,
+    larger,
+    root,
+    smaller,
+    spread,
+)
+from sph_ros.core.vector_memory import (
+    gather,
+    gather_points,
+    load,
+    prefetch,
+    store,
+    take,
+    take_points,
+)
 
 #: Gradients and nearness are kept as whole multiples of 1 / `STEPS` of the largest.
 STEPS = np.float32(32767.0)
@@ -22,10 +39,10 @@ STEPS = np.float32(32767.0)
 #: 0 / tiny is 0.
 TINY = np.float32(1e-20)
 
-#: Entries of lists for which there is no room in the processor's last cache (10 bytes each), about;
-#: and how far ahead those are asked for: what comes from memory takes longest of all, and the
-#: processor does not see by itself that it goes on behind the other readings.
-FAR, AHEAD = 2_500_000, 2048
+#: Lists of more entries (of 10 bytes) are not in the last cache when they are read again. Those are
+#: asked for so many entries ahead: what is read in between hides from the processor that it is to
+#: go on. In a cache it finds them sooner than it can be asked, which then costs a tenth.
+FAR, AHEAD = LAST_CACHE // 10, 2048
 
 
 class Pairs(NamedTuple):
@@ -72,8 +89,15 @@ def are_far(pairs):
 
 
 @inlined
-def expect(pairs, k, far):
-    """Let the processor ask for entries behind those at k, if they are far."""
+def expect(entries, k, far):
+    """Have some of the entries behind those at k read beforehand, if they are far."""
+    if far:
+        prefetch(entries, k + AHEAD)
+
+
+@inlined
+def expect_all(pairs, k, far):
+    """The same of neighbours and gradients."""
     if far:
         prefetch(pairs.neighbors, k + AHEAD)
         prefetch(pairs.x, k + AHEAD)
@@ -96,7 +120,7 @@ def push_by_pairs(pairs, values, first):
     own, far = take(values, first), are_far(pairs)
     x, y, z = spread(np.float32(0.0)), spread(np.float32(0.0)), spread(np.float32(0.0))
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
-        expect(pairs, k, far)
+        expect_all(pairs, k, far)
         both = own + gather(values, load(pairs.neighbors, k))
         x += both * load(pairs.x, k)
         y += both * load(pairs.y, k)
@@ -117,7 +141,7 @@ def divergence_of_pairs(pairs, displacements, first):
     x, y, z = take_points(displacements, first, 0)
     change, far = spread(np.float32(0.0)), are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
-        expect(pairs, k, far)
+        expect_all(pairs, k, far)
         there_x, there_y, there_z = gather_points(displacements, load(pairs.neighbors, k))
         change += load(pairs.x, k) * (x - there_x)
         change += load(pairs.y, k) * (y - there_y)
@@ -145,7 +169,9 @@ def impulse_of_pairs(pairs, positions, velocities, first, inverse_h, linear, qua
     px, py, pz = take_points(positions, first, 0)
     vx, vy, vz = take_points(velocities, first, 0)
     ax, ay, az = spread(zero), spread(zero), spread(zero)
+    far = are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        expect(pairs.neighbors, k, far)
         j = load(pairs.neighbors, k)
         x, y, z = gather_points(positions, j)
         x, y, z = px - x, py - y, pz - z
@@ -182,7 +208,7 @@ def weights_after(pairs, positions, displacements, first, support_radius, bend):
     ux, uy, uz = take_points(displacements, first, 0)
     weights, linear, far = spread(zero), spread(zero), are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
-        expect(pairs, k, far)
+        expect_all(pairs, k, far)
         j = load(pairs.neighbors, k)
         mx, my, mz = gather_points(displacements, j)
         mx, my, mz = ux - mx, uy - my, uz - mz
@@ -216,7 +242,9 @@ def geometry_of_pairs(pairs, positions, first, inverse_h, bend):
     x, y, z = take_points(positions, first, 0)
     w, n, square = spread(zero), spread(zero), spread(zero)
     tx, ty, tz = spread(zero), spread(zero), spread(zero)
+    far = are_far(pairs)
     for k in range(pairs.start[first], pairs.stop[first // LANES], LANES):
+        expect_all(pairs, k, far)
         j = load(pairs.neighbors, k)
         dx, dy, dz = gather_points(positions, j)
         dx, dy, dz = x - dx, y - dy, z - dz

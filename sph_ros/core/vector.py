@@ -48,6 +48,21 @@ def _gathers_quickly():
 #: Whether to gather by the processor's own instructions.
 GATHERS = _gathers_quickly()
 
+#: Where the kernel says how large the last cache is before memory.
+CACHE_SIZE = Path("/sys/devices/system/cpu/cpu0/cache/index3/size")
+
+
+def _last_cache():
+    """Bytes of the last cache; a usual size where the kernel does not say."""
+    try:
+        return 1024 * int(CACHE_SIZE.read_text(encoding="ascii").strip().removesuffix("K"))
+    except (OSError, ValueError):
+        return 1 << 25
+
+
+#: [bytes]
+LAST_CACHE = _last_cache()
+
 #: The same freedom as all other code has: see `core.jit`.
 FAST = ("reassoc", "contract", "nsz")
 

@@ -76,8 +76,8 @@ def solve_pressures(
     """Scaled pressures that hold the density, and the displacements they cause.
 
     Args:
-        work: `Workspace` with pairs, contacts, diagonal, the displacements without pressure in `cohesive`
-            and a first guess by `scale_guess`; `scaled` and `displacements` are written.
+        work: `Workspace` with pairs, contacts, diagonal, the displacements without pressure in
+            `cohesive` and a first guess by `scale_guess`; `scaled` and `displacements` are written.
         densities: without displacement, relative to rest [-], (N,).
         compliance: density per scaled pressure that the liquid yields [1/m^2], float32.
         goal: `Goal`.

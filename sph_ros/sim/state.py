@@ -268,9 +268,7 @@ class Workspace:
         self.sums = Sums(*(rows[:count] for rows in self._sums))
         lists = {name: getattr(self._contacts, name)[:count] for name in self.CONTACTS}
         slices = -(-count // LANES)
-        self.contacts = self._contacts._replace(
-            **lists, touching=self._contacts.touching[:slices]
-        )
+        self.contacts = self._contacts._replace(**lists, touching=self._contacts.touching[:slices])
         self._fit_pairs()
 
     def _allocate_pairs(self, per_particle):
