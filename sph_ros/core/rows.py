@@ -4,7 +4,7 @@
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import kernel, parallel_kernel
+from sph_ros.core.jit import bare_kernel, kernel, parallel_kernel
 
 #: Coordinates of sixteen particles.
 BLOCK = 48
@@ -66,6 +66,20 @@ def all_finite(values):
     for k in range(flat.size):
         zeros += np.float32(0.0) * flat[k]
     return zeros == np.float32(0.0)
+
+
+@bare_kernel
+def put_rows(rows, places, result):
+    """result[places[k]] = rows[k].
+
+    Args:
+        rows: (N, K) float32.
+        places: each row once, (N,) int32.
+        result: (N, K) float32; written.
+    """
+    for k in range(places.shape[0]):
+        for column in range(rows.shape[1]):
+            result[places[k], column] = rows[k, column]
 
 
 @parallel_kernel

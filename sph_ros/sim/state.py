@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arrays that change during a simulation, and the scratch memory of a step, kept apart."""
 
+import math
+
 import numpy as np
 
 from sph_ros.core.chunks import CHUNK, chunk_count
 from sph_ros.core.contacts import TERMS, Contacts
 from sph_ros.core.neighbors import Grid, Sums
 from sph_ros.core.pair_sums import Pairs
-from sph_ros.core.rows import gather_state
+from sph_ros.core.rows import gather_state, put_rows
 from sph_ros.core.vector import LANES
 
 #: Cells of a grid; beyond, its outermost cells hold what lies farther out.
@@ -112,7 +114,11 @@ class Fluid:
     def public(self, rows):
         """Copy of an array with a row per particle, in public order."""
         result = np.empty_like(rows)
-        result[self.particle] = rows
+        if rows.dtype == np.float32:  # numpy takes five times as long
+            table = len(rows), math.prod(rows.shape[1:])
+            put_rows(rows.reshape(table), self.particle, result.reshape(table))
+        else:
+            result[self.particle] = rows
         return result
 
     def reorder(self, starts, ends, work):
@@ -337,18 +343,20 @@ def make_grid(lower, upper, cell, count):
     longest axes are cut until the number of cells is in proportion.
     """
     limit = max(MOST_CELLS_PER_PARTICLE * count, MOST_CELLS_AT_LEAST)
-    extent = np.maximum(np.asarray(upper, np.float64) - lower, 0.0)
-    counts = np.floor(np.minimum(extent / cell, 1e6)).astype(np.int64) + 1
-    while int(np.prod(counts)) > limit:
-        axis = int(np.argmax(counts))
+    # Plain numbers: numpy takes several times as long for three of them, in every step.
+    extent = [max(float(b) - float(a), 0.0) for a, b in zip(lower, upper, strict=True)]
+    counts = [int(min(length / cell, 1e6)) + 1 for length in extent]
+    while math.prod(counts) > limit:
+        axis = counts.index(max(counts))
         counts[axis] = max(counts[axis] // 2, 1)
     # Runs of candidates lie along the second longest axis, and not along the shortest, so that few
     # of them end early.
-    axes = np.argsort(extent, kind="stable")[[1, 0, 2]].astype(np.int32)
+    shortest, middle, longest = sorted(range(3), key=extent.__getitem__)
+    axes = middle, shortest, longest
     return Grid(
-        axes,
-        np.asarray(lower, np.float32)[axes],
+        np.array(axes, np.int32),
+        np.array([lower[axis] for axis in axes], np.float32),
         np.float32(1.0 / cell),
-        counts[axes].astype(np.int32),
-        np.zeros(int(np.prod(counts)) + 1, np.int32),
+        np.array([counts[axis] for axis in axes], np.int32),
+        np.zeros(math.prod(counts) + 1, np.int32),
     )
