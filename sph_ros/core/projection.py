@@ -62,27 +62,30 @@ def contact_velocities(positions, motion, inverse_step, contacts):
     """
     # A name of its own: numba loses writes to arrays of a tuple inside prange.
     terms, solids = contacts.terms, contacts.solid
-    still = 0
-    for s in range(motion.position.shape[0]):
-        still += is_still(motion, s)
-    if still == motion.position.shape[0]:
+    moving = np.zeros(motion.position.shape[0], np.bool_)
+    for s in range(moving.shape[0]):
+        moving[s] = not is_still(motion, s)
+    if not moving.any():
         return
     count, chunks = positions.shape[0], chunk_count(positions.shape[0])
     turns = fresh_turns()
     for part in prange(PARTS):
         chunk = next_chunk(turns, part, chunks)
         while chunk >= 0:
-            for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
-                for k in range(contacts.start[i], contacts.end[i]):
-                    s = solids[k]
-                    if is_still(motion, s):
-                        continue
-                    x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-                    lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
-                    nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
-                    terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
-                    terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
-                    terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
+            i = np.intp(chunk * CHUNK)
+            # Most contacts are with what stands still, so that of few the particle is looked up.
+            for k in range(contacts.start[i], contacts.end[min(i + CHUNK, count) - 1]):
+                s = solids[k]
+                if not moving[s]:
+                    continue
+                while contacts.end[i] <= k:
+                    i += 1
+                x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+                lx, ly, lz = to_solid(motion.old_rotation, motion.old_position, s, x, y, z)
+                nx, ny, nz = to_world(motion.rotation, motion.position, s, lx, ly, lz)
+                terms[k, SURFACE_VELOCITY] = (nx - x) * inverse_step
+                terms[k, SURFACE_VELOCITY + 1] = (ny - y) * inverse_step
+                terms[k, SURFACE_VELOCITY + 2] = (nz - z) * inverse_step
             chunk = next_chunk(turns, part, chunks)
 
 
