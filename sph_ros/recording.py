@@ -10,7 +10,7 @@ import numpy as np
 
 from msg_adapters.bags import BagWriter
 from msg_adapters.marker import MARKER, MARKER_ARRAY, marker_to_cdr, markers_to_cdr
-from msg_adapters.point_cloud import POINT_CLOUD2, particle_cloud_to_cdr
+from msg_adapters.point_cloud import POINT_CLOUD2, point_cloud_to_cdr
 from msg_adapters.pose import POSE_STAMPED, pose_to_cdr
 from msg_adapters.wrench import WRENCH_STAMPED, wrench_to_cdr
 from sph_ros.scene_markers import SolidMarkers, surface_color, surface_marker
@@ -92,9 +92,7 @@ class BagRecorder:
         def write(topic, message_type, data):
             self._bag.write(f"{NODE}/{topic}", message_type, stamp, data)
 
-        cloud = particle_cloud_to_cdr(
-            sim.positions, sim.velocities, sim.densities, sim.ids, stamp, self._frame_id
-        )
+        cloud = point_cloud_to_cdr(sim.particles, stamp, self._frame_id)
         write("particles", POINT_CLOUD2, cloud)
         for name in sim.solid_names:
             solid = sim.solid(name)

@@ -18,6 +18,7 @@ def warm_up(sim):
     sim.statistics()
     scene = sim.scene
     extract_surface(sim.positions, scene.spacing, scene.support_radius, dimension=scene.dimension)
+    sim.particles  # noqa: B018
     sim.reset()
 
 

@@ -529,7 +529,7 @@ def test_mistakes_are_one_line_and_exit_status_1(parameter, expected, tmp_path):
     assert len(output.strip().splitlines()) == 1, output
 
 
-@pytest.mark.parametrize("broken", ["step", "densities"])
+@pytest.mark.parametrize("broken", ["step", "particles"])
 def test_a_fault_stops_the_liquid_but_not_the_node(broken, scene_path, monkeypatch):
     from rclpy.parameter import Parameter as NodeParameter
 

@@ -50,6 +50,17 @@ def test_arrays_have_the_promised_shapes_and_are_copies(sim):
     assert sim.positions.max() > 0.1
 
 
+def test_particles_are_all_of_these_in_one(sim):
+    sim.advance(0.05)
+    cloud = sim.particles
+    assert cloud.dtype.names == ("x", "y", "z", "vx", "vy", "vz", "density", "id")
+    columns = [cloud[name] for name in cloud.dtype.names]
+    np.testing.assert_array_equal(np.stack(columns[:3], axis=1), sim.positions)
+    np.testing.assert_array_equal(np.stack(columns[3:6], axis=1), sim.velocities)
+    np.testing.assert_array_equal(columns[6], sim.densities)
+    np.testing.assert_array_equal(columns[7], sim.ids)
+
+
 def test_a_row_is_the_same_particle_for_ever(sim):
     before = sim.positions
     sim.step()

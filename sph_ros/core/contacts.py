@@ -27,8 +27,9 @@ from sph_ros.core.contact_data import (
     write_surface_velocity,
 )
 from sph_ros.core.distances import normal_called, signed_distance
-from sph_ros.core.jit import called, inlined, parallel_kernel
+from sph_ros.core.jit import called, inlined
 from sph_ros.core.sheet_contacts import add_sheet_contacts
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.thin_films import add_film_walls, add_films
 from sph_ros.core.vector import LANES
 from sph_ros.core.walls import wall_terms

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import called, inlined, parallel_kernel
+from sph_ros.core.jit import called, inlined
+from sph_ros.core.team import parallel_kernel
 
 SPHERE, BOX, CAPSULE, CYLINDER, PLANE, GRID, UNION, INTERSECTION = range(8)
 

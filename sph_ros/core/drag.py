@@ -11,7 +11,8 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contacts import FRACTION, NORMAL, SURFACE_VELOCITY, add_reaction
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import inlined
+from sph_ros.core.team import parallel_kernel
 
 
 @inlined

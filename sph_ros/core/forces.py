@@ -23,8 +23,8 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.contacts import GRADIENT, NEAR_GRADIENT, SURFACE_VELOCITY, add_reaction
-from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, inverse_root, larger, smaller, spread
 from sph_ros.core.vector_memory import gather, gather_points, load, put, store, take, take_points
 

@@ -11,18 +11,9 @@ differently and the result would depend on how the loop was split among threads.
 import hashlib
 import os
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 
-# A thread that waits for the others spins for some microseconds, then sleeps. Sleeping at once
-# costs a step of 5,000 particles half its speed in wake-ups; spinning on takes the processor from
-# the very thread it waits for as soon as other programs run too, and a step then takes ten times as
-# long: with twice as many turns two nodes that never wait do two thirds as much together. Read by
-# libgomp when it is loaded, at the first parallel call.
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
-from numba import config, get_num_threads, njit, set_num_threads  # noqa: E402
+from numba import cfunc, config, njit
 
 FASTMATH = {"reassoc", "contract", "nsz"}
 
@@ -55,66 +46,47 @@ def _cache_folder():
     return str(folder)
 
 
-def _compiler(**options):
+def compiler(**options):
     """A decorator like njit with our policy, whose kernels are cached in our folder."""
+    return _kept(njit(fastmath=FASTMATH, cache=True, error_model="numpy", **options))
+
+
+def callback(signature):
+    """A decorator for what other code calls by its address, with one signature."""
+    return _kept(cfunc(signature, cache=True, error_model="numpy"))
+
+
+def _kept(decorator):
+    """The same decorator, with its cache in our folder."""
 
     def decorate(function):
         before, config.CACHE_DIR = config.CACHE_DIR, KERNELS
         try:
-            return njit(fastmath=FASTMATH, cache=True, error_model="numpy", **options)(function)
+            return decorator(function)
         finally:
             config.CACHE_DIR = before
 
     return decorate
 
 
-@contextmanager
-def one_thread():
-    """Kernels called within run on the calling thread alone.
-
-    Each thread that calls parallel kernels gets helpers of its own, which then live as long as it
-    does. Once there are more helpers in a process than processors, libgomp's threads no longer spin
-    but sleep when they wait for each other, and steps take a quarter longer. So only one thread of
-    a process should have any.
-    """
-    before = get_num_threads()
-    set_num_threads(1)
-    try:
-        yield
-    finally:
-        set_num_threads(before)
-
-
 #: Folder of the compiled kernels of these sources in this place.
 KERNELS = _cache_folder()
 
 #: A small function, meant to be inlined into the kernels that call it; may make and return arrays.
-device = _compiler()
+device = compiler()
 
 #: A function that reads and writes arrays, or tuples of many of them, but neither makes nor returns
 #: any, and is always part of its caller's code. References are not counted in it, which else takes
 #: longer than the distance to a solid, and lets threads wait for each other. A function that
 #: returned an array would corrupt memory.
-inlined = _compiler(forceinline=True, _nrt=False)
+inlined = compiler(forceinline=True, _nrt=False)
 
 #: The same as a function of its own: for what is long, or called from many places.
-called = _compiler(_nrt=False)
+called = compiler(_nrt=False)
 
 #: A loop over arrays on one thread; the GIL is released.
-kernel = _compiler(nogil=True)
+kernel = compiler(nogil=True)
 
 #: The same without counted references, see `inlined`: a third to a half of the time where a loop
 #: calls functions with many arrays.
-bare_kernel = _compiler(nogil=True, _nrt=False)
-
-#: What numba makes parallel: loops that say so, and nothing else. It need not look for more.
-LOOPS = {
-    "prange": True,
-    **dict.fromkeys(("comprehension", "reduction", "inplace_binop", "setitem", "numpy"), False),
-    **dict.fromkeys(("stencil", "fusion"), False),
-}
-
-#: A loop over arrays spread over threads. Iteration i of `prange` may write row i only. Give arrays
-#: that are fields of a tuple a local name before the loop: numba loses direct writes to them inside
-#: `prange`. What takes long in every step is shared out by `core.chunks`.
-parallel_kernel = _compiler(nogil=True, parallel=LOOPS)
+bare_kernel = compiler(nogil=True, _nrt=False)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK
-from sph_ros.core.jit import parallel_kernel
+from sph_ros.core.team import parallel_kernel
 
 
 @parallel_kernel

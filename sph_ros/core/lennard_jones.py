@@ -12,7 +12,7 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contacts import GRADIENT, add_reaction
-from sph_ros.core.jit import parallel_kernel
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES
 
 #: Pairs do not repel harder than at this distance, in a: a pair that starts closer must not fly

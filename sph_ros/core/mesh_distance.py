@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, kernel, parallel_kernel
+from sph_ros.core.jit import device, kernel
+from sph_ros.core.team import parallel_kernel
 
 #: Triangles of one leaf of the cluster tree.
 LEAF_SIZE = 8

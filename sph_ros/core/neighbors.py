@@ -15,9 +15,10 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
-from sph_ros.core.jit import device, inlined, parallel_kernel
+from sph_ros.core.jit import device, inlined
 from sph_ros.core.near_points import append_near
 from sph_ros.core.pair_sums import STEPS, TINY, filling_of, geometry_of_pairs
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, inverse_root, larger, spread
 from sph_ros.core.vector_memory import (
     gather_column,
@@ -29,6 +30,9 @@ from sph_ros.core.vector_memory import (
     take_points,
     turn,
 )
+
+#: Particles are sorted in so many pieces at once.
+HALVES = 2
 
 
 class Grid(NamedTuple):
@@ -89,25 +93,29 @@ def sort_by_cell(positions, grid, cell_of, order):
     a, b, c = grid.axes[0], grid.axes[1], grid.axes[2]
     cell_start, count = grid.cell_start, positions.shape[0]
     cells = nx * ny * nz
-    for i in prange(count):
-        cx = cell_coordinate(positions[i, a], grid.lower[0], grid.inverse_cell, nx)
-        cy = cell_coordinate(positions[i, b], grid.lower[1], grid.inverse_cell, ny)
-        cz = cell_coordinate(positions[i, c], grid.lower[2], grid.inverse_cell, nz)
-        cell_of[i] = (cz * ny + cy) * nx + cx
+    places = np.zeros((HALVES, cells), np.int32)
+    for half in prange(HALVES):
+        for i in range(count * half // HALVES, count * (half + 1) // HALVES):
+            cx = cell_coordinate(positions[i, a], grid.lower[0], grid.inverse_cell, nx)
+            cy = cell_coordinate(positions[i, b], grid.lower[1], grid.inverse_cell, ny)
+            cz = cell_coordinate(positions[i, c], grid.lower[2], grid.inverse_cell, nz)
+            cell = (cz * ny + cy) * nx + cx
+            cell_of[i] = cell
+            places[half, cell] += 1
+    # From how many there are to where the first one goes.
+    place = np.int32(0)
     for cell in range(cells):
-        cell_start[cell] = 0
-    for i in range(count):
-        cell_start[cell_of[i]] += 1
-    # First the end of each cell, which then moves down to its start.
-    end = 0
-    for cell in range(cells):
-        end += cell_start[cell]
-        cell_start[cell] = end
+        cell_start[cell] = place
+        for half in range(HALVES):
+            here = places[half, cell]
+            places[half, cell] = place
+            place += here
     cell_start[cells] = count
-    for i in range(count - 1, -1, -1):
-        cell = cell_of[i]
-        cell_start[cell] -= 1
-        order[cell_start[cell]] = i
+    for half in prange(HALVES):
+        for i in range(count * half // HALVES, count * (half + 1) // HALVES):
+            cell = cell_of[i]
+            order[places[half, cell]] = i
+            places[half, cell] += 1
 
 
 @inlined

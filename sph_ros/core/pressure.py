@@ -12,8 +12,9 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
 from sph_ros.core.contact_data import wall_gradients
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import inlined
 from sph_ros.core.pair_sums import divergence_of_pairs, push_by_pairs
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, larger, magnitude, spread, total, where
 from sph_ros.core.vector_memory import lanes_from, put, take, take_points
 

@@ -25,8 +25,9 @@ from sph_ros.core.contact_data import (
     to_world,
     wall_gradients,
 )
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import inlined
 from sph_ros.core.pair_sums import weights_after
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, larger, smaller, spread, where
 from sph_ros.core.vector_memory import gather_column, lanes_from, put, take, take_points
 

@@ -20,8 +20,8 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK, PARTS, chunk_count, fresh_turns, next_chunk, slices_of
-from sph_ros.core.jit import parallel_kernel
 from sph_ros.core.pair_sums import STEPS, impulse_of_pairs
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, spread
 from sph_ros.core.vector_memory import gather, load, put, take, take_points
 

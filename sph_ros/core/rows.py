@@ -4,7 +4,8 @@
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import bare_kernel, kernel, parallel_kernel
+from sph_ros.core.jit import bare_kernel, kernel
+from sph_ros.core.team import parallel_kernel
 
 #: Coordinates of sixteen particles.
 BLOCK = 48
@@ -80,6 +81,28 @@ def put_rows(rows, places, result):
     for k in range(places.shape[0]):
         for column in range(rows.shape[1]):
             result[places[k], column] = rows[k, column]
+
+
+@parallel_kernel
+def put_particles(positions, velocities, densities, ids, places, result):
+    """Tell of each particle all that others want to know.
+
+    Args:
+        positions: [m], (N, 3).
+        velocities: [m/s], (N, 3).
+        densities: [kg/m^3], (N,).
+        ids: (N,) uint32, in the order of the result.
+        places: where each row goes, (N,) int32.
+        result: x, y, z, vx, vy, vz, density, and the bits of the id, (N, 8) uint32; written.
+    """
+    numbers = result.view(np.float32)
+    for k in prange(places.shape[0]):
+        row = places[k]
+        for axis in range(3):
+            numbers[row, axis] = positions[k, axis]
+            numbers[row, 3 + axis] = velocities[k, axis]
+        numbers[row, 6] = densities[k]
+        result[row, 7] = ids[row]
 
 
 @parallel_kernel

@@ -26,7 +26,7 @@ from sph_ros.core.contact_data import (
     to_world,
     write_surface_velocity,
 )
-from sph_ros.core.jit import called, inlined, parallel_kernel
+from sph_ros.core.jit import called, inlined
 from sph_ros.core.sheets import (
     CORNER_CONTACTS,
     cell_of,
@@ -34,6 +34,7 @@ from sph_ros.core.sheets import (
     nearest_in_cell,
     nearest_on_sheet,
 )
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES
 from sph_ros.core.walls import MIRRORED, wall_share
 

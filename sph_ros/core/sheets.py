@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import called, inlined, kernel, parallel_kernel
+from sph_ros.core.jit import called, inlined, kernel
+from sph_ros.core.team import parallel_kernel
 
 #: Triangles count as so much larger when a path is tested against them, as a share of their edges:
 #: no path slips through between two that share an edge.

@@ -23,7 +23,8 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import PARTS, chunk_count, fresh_turns, next_chunk, slices_of
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import inlined
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES, larger, smaller, spread
 from sph_ros.core.vector_memory import gather_points, load, put, take, take_points
 

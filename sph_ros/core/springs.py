@@ -13,7 +13,8 @@ import numpy as np
 from numba import prange
 
 from sph_ros.core.chunks import CHUNK
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import device
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES
 
 _TABLE = 256

@@ -25,8 +25,9 @@ from numba import prange
 
 from sph_ros.core.chunks import CHUNK
 from sph_ros.core.contact_data import DISTANCE, GRADIENT, NORMAL, add_reaction
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import device
 from sph_ros.core.neighbors import cell_coordinate
+from sph_ros.core.team import parallel_kernel
 from sph_ros.core.vector import LANES
 
 #: Cells of one support radius on each side of a particle's own that the reach covers.

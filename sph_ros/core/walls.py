@@ -39,7 +39,8 @@ from sph_ros.core.distances import (
     to_leaf,
     trilinear,
 )
-from sph_ros.core.jit import inlined, parallel_kernel
+from sph_ros.core.jit import inlined
+from sph_ros.core.team import parallel_kernel
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)

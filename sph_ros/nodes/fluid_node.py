@@ -10,7 +10,6 @@ whatever comes then (a bag that loops, a simulator that was reset) is another ru
 """
 
 import sys
-from contextlib import nullcontext
 from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -24,7 +23,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from sph_ros.core.jit import one_thread
 from sph_ros.nodes.diagnostics import (
     SLOW,
     Speedometer,
@@ -77,9 +75,7 @@ class FluidNode(Node):
     def _set_up(self):
         self._settings = Settings(self)
         scene_name, self._step_mode = self._settings.declare_first()
-        # The thread that steps gets helpers; this one needs none.
-        helpers = nullcontext() if self._step_mode == "lockstep" else one_thread()
-        with tell_while_waiting(self._tell), helpers:
+        with tell_while_waiting(self._tell):
             scene = load_scene(scene_name)
             self._settings.declare_live(scene.material, self._step_mode)
             self._runner = Runner(scene, self._settings.material())
@@ -209,7 +205,7 @@ class FluidNode(Node):
     def _prepare_scene(self, name):
         """Load a scene that is to take the place of the present one; SceneError if it cannot.
 
-        The driver does it: kernels on many threads must not be called by two threads at once.
+        The driver does it, whose kernels have the helpers.
         """
 
         def load():

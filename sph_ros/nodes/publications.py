@@ -13,7 +13,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.marker import delete_marker, marker_to_cdr, markers_to_cdr
 from msg_adapters.mesh import mesh_to_cdr
-from msg_adapters.point_cloud import particle_cloud_to_cdr
+from msg_adapters.point_cloud import point_cloud_to_cdr
 from msg_adapters.wrench import wrench_to_cdr
 from sph_ros.core.surface import extract_surface
 from sph_ros.scene_markers import SolidMarkers, surface_color, surface_marker
@@ -81,21 +81,15 @@ class Publications:
         """
         sim = self._runner.sim
         wants_surface = surface_due and (_heard(self._surface) or _heard(self._surface_mesh))
-        wants_particles = _heard(self._particles)
-        positions = sim.positions if wants_surface or wants_particles else None
-        if wants_particles:
-            self._particles.publish(
-                particle_cloud_to_cdr(
-                    positions, sim.velocities, sim.densities, sim.ids, stamp_ns, self._frame
-                )
-            )
+        if _heard(self._particles):
+            self._particles.publish(point_cloud_to_cdr(sim.particles, stamp_ns, self._frame))
         if _heard(self._solids):
             self._publish_solids(stamp_ns)
         self._publish_wrenches(stamp_ns)
         if not wants_surface:
             return None
         families = sim.families if len(sim.scene.liquids) > 1 else None
-        return SurfaceJob(positions, stamp_ns, sim.scene, families)
+        return SurfaceJob(sim.positions, stamp_ns, sim.scene, families)
 
     def surface(self, job):
         """Extract and publish a surface; returns its number of triangles. For any thread."""

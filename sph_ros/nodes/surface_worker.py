@@ -4,6 +4,8 @@
 import threading
 import time
 
+from sph_ros.core.team import beside
+
 
 class SurfaceWorker:
     """Works on one job at a time; a job that waits is replaced by a newer one.
@@ -58,4 +60,5 @@ class SurfaceWorker:
                 if self._stopping:
                     return
                 job, self._job = self._job, None
-            self.work(job)
+            with beside():
+                self.work(job)

@@ -8,7 +8,8 @@ rows, so the picture does not depend on the number of threads.
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, inlined, parallel_kernel
+from sph_ros.core.jit import device, inlined
+from sph_ros.core.team import parallel_kernel
 from sph_ros.render.optics import LAMP, LAMP_LIGHT, SKY_LIGHT, lamp_glint, reflect
 
 #: Bands of rows per picture; more than threads, because the liquid fills only some.

@@ -10,7 +10,8 @@ refracted ray is followed into the room itself, so the tiles bend as they should
 import numpy as np
 from numba import prange
 
-from sph_ros.core.jit import device, parallel_kernel
+from sph_ros.core.jit import device
+from sph_ros.core.team import parallel_kernel
 from sph_ros.render.optics import (
     WATER_INDEX,
     fresnel,

@@ -5,7 +5,6 @@ A step that leaves anything that is no number ends the simulation with one line:
 particle, where in the step it began, and the file with the state before that step.
 """
 
-import copy
 import dataclasses
 import math
 import os
@@ -121,7 +120,7 @@ class Guard:
             else:
                 np.copyto(kept, rows)  # the same memory each time: that of new arrays costs more
         self._numbers = numbers
-        self._solids = [_shallow(solid) for solid in solids]
+        self._solids = [solid.twin() for solid in solids]
 
     def snapshot(self):
         """(arrays, numbers) of the remembered state, for `write_snapshot`."""
@@ -183,12 +182,3 @@ def _first_bad(rows):
 def _ones(arrays):
     """Densities nobody can know any more: those at rest."""
     return np.ones(len(arrays["particle"]), np.float32)
-
-
-def _shallow(solid):
-    """A twin whose own arrays and queues do not change with the solid."""
-    twin = copy.copy(solid)
-    for name, value in vars(solid).items():
-        if hasattr(value, "copy"):
-            setattr(twin, name, value.copy())
-    return twin

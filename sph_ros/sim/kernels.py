@@ -284,6 +284,7 @@ def _take_every_way(scene, dimension):
         simulation.move_solid("ball", [0.05, 0.05, 0.08])
     simulation.advance(0.02)
     simulation.statistics()
+    simulation.particles  # noqa: B018
 
 
 def main(names):

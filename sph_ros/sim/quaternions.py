@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unit quaternions (x, y, z, w) on plain float64 arrays of shape (4,)."""
+"""Unit quaternions (x, y, z, w) on plain float64 arrays of shape (4,).
+
+Sums of few numbers are done on Python's own: numpy's scalars take three times as long.
+"""
 
 import math
 
@@ -23,7 +26,7 @@ def normalized(quat_xyzw):
 
 def to_matrix(quat_xyzw):
     """Rotation matrix (3, 3) of a unit quaternion."""
-    x, y, z, w = quat_xyzw
+    x, y, z, w = _numbers(quat_xyzw)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -44,8 +47,8 @@ def rotated_back(vectors, quat_xyzw):
 
 def multiply(a_xyzw, b_xyzw):
     """The rotation b followed by a."""
-    ax, ay, az, aw = a_xyzw
-    bx, by, bz, bw = b_xyzw
+    ax, ay, az, aw = _numbers(a_xyzw)
+    bx, by, bz, bw = _numbers(b_xyzw)
     return np.array(
         [
             aw * bx + ax * bw + ay * bz - az * by,
@@ -58,7 +61,8 @@ def multiply(a_xyzw, b_xyzw):
 
 def conjugate(quat_xyzw):
     """The inverse rotation of a unit quaternion."""
-    return np.array([-quat_xyzw[0], -quat_xyzw[1], -quat_xyzw[2], quat_xyzw[3]])
+    x, y, z, w = _numbers(quat_xyzw)
+    return np.array([-x, -y, -z, w])
 
 
 def rotation_vector(quat_xyzw):
@@ -88,3 +92,7 @@ def between(start_xyzw, end_xyzw):
 def turned(start_xyzw, vector):
     """`start_xyzw` turned further by a rotation vector [rad] in the world frame."""
     return normalized(multiply(from_rotation_vector(vector), start_xyzw))
+
+
+def _numbers(quat_xyzw):
+    return np.asarray(quat_xyzw, np.float64).tolist()

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sph_ros.core.rows import all_finite, farthest_coordinates
+from sph_ros.core.rows import all_finite, farthest_coordinates, put_particles
 from sph_ros.core.surface import extract_surface
 from sph_ros.sim.abilities import alike, faults
 from sph_ros.sim.emitters import Emitters
@@ -24,6 +24,12 @@ from sph_ros.sim.snapshots import read_snapshot, write_snapshot
 from sph_ros.sim.solids import Solids
 from sph_ros.sim.solvers import SOLVER_CLASSES
 from sph_ros.sim.state import FAMILY, Fluid, family_of
+
+#: What `Simulation.particles` tells of each.
+PARTICLE = np.dtype(
+    [(name, np.float32) for name in ("x", "y", "z", "vx", "vy", "vz", "density")]
+    + [("id", np.uint32)]
+)
 
 #: A substep may carry a solid by so many spacings and a particle by so many support radii.
 SOLID_REACH, PARTICLE_REACH = 0.75, 0.8
@@ -268,6 +274,27 @@ class Simulation:
         return self._fluid.public(self._relative_densities() * rest)
 
     @property
+    def ids(self):
+        """Number of each particle, given once and never again, (N,) uint32; a copy."""
+        return self._fluid.ids.copy()
+
+    @property
+    def particles(self):
+        """All of the above in one, (N,) structured: float32 x y z vx vy vz density, uint32 id."""
+        fluid = self._fluid
+        result = np.empty(len(fluid), PARTICLE)
+        densities = self._relative_densities() * self._solver.rest_densities(fluid)
+        put_particles(
+            fluid.positions,
+            fluid.velocities,
+            densities,
+            fluid.ids,
+            fluid.particle,
+            result.view(np.uint32).reshape(-1, len(PARTICLE)),
+        )
+        return result
+
+    @property
     def families(self):
         """Index into `scene.liquids` of each particle's liquid, (N,) uint8; a copy."""
         return self._fluid.public(family_of(self._fluid))
@@ -276,11 +303,6 @@ class Simulation:
     def pressures(self):
         """Pressures of the last step [Pa], surface tension's own included, (N,) float32; a copy."""
         return self._fluid.public(self._solver.pressures(self._fluid))
-
-    @property
-    def ids(self):
-        """Number of each particle, given once and never again, (N,) uint32; a copy."""
-        return self._fluid.ids.copy()
 
     def _relative_densities(self):
         if self._densities is None:

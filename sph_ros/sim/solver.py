@@ -90,6 +90,8 @@ class Solver:
 
     def rest_densities(self, fluid):
         """Rest density of each particle [kg/m^3], (N,) float32, rows as in `fluid`."""
+        if not self._mixed:
+            return np.full(len(fluid), self._material.density, np.float32)
         table = np.array([material.density for material in self.materials], np.float32)
         return table[family_of(fluid)]
 
