@@ -16,7 +16,7 @@ from numba import prange
 
 from sph_ros.core import team
 from sph_ros.core.atomics import words
-from sph_ros.core.team import beside, parallel_kernel
+from sph_ros.core.team import parallel_kernel
 
 needs_helpers = pytest.mark.skipif(
     words[team.HELPERS] == 0, reason="no helpers: one processor, no Linux, or a layer of numba's"
@@ -107,18 +107,6 @@ def test_helpers_that_have_gone_to_sleep_come_back():
             assert time.monotonic() < deadline, "nobody wakes it"
             count_visits(visits, 10)
         assert np.unique(visits).size == 1
-
-
-@needs_helpers
-def test_a_thread_beside_takes_a_helpers_place():
-    helpers = words[team.HELPERS]
-    with beside():
-        assert words[team.BESIDE] == 1
-        visits = np.zeros(1003, np.int64)
-        count_visits(visits, 1000)
-        np.testing.assert_array_equal(visits, 1000)
-    assert words[team.BESIDE] == 0
-    assert words[team.HELPERS] == helpers
 
 
 def test_one_thread_and_a_forked_process_do_all_alone():

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sph_ros.core.jit import device, kernel
+from sph_ros.core.jit import bare_kernel, device, inlined, kernel
 from sph_ros.core.marching import marching_cubes
 
 #: Level of the colour field that is called the surface: half way between air and liquid.
@@ -143,10 +143,14 @@ def colour_field(positions, grid, spacing, support_radius, dimension=3, shifts=N
     field = np.empty_like(raw)
     scratch = np.empty_like(raw)
     arguments = (positions, shifts, grid.cell, grid.first, knot[0], flat)
-    _splat(*arguments, weights, raw)
+    splat, lonely_weights = _splat, _lonely_weights
+    if not flat and knot[0] == grid.cell[0]:  # as usual
+        splat, lonely_weights = _splat_by_cells, _lonely_weights_by_cells
+        arguments = (positions, shifts, 1.0 / grid.cell, grid.first)
+    splat(*arguments, weights, raw)
     _blur(raw, passes, flat, scratch, field)
-    _lonely_weights(*arguments, field, weights)
-    _splat(*arguments, weights, raw)
+    lonely_weights(*arguments, field, weights)
+    splat(*arguments, weights, raw)
     _blur(raw, passes, flat, scratch, field)
     _settle(field, flat)
     return field
@@ -433,14 +437,6 @@ def _splat(positions, shifts, cell, first, knot, flat, weights, field):  # the l
         if not flat:
             y = _axis_weights(positions[p, 1], cell[1], first[1], shifts[s, 1], knot, wy)
         z = _axis_weights(positions[p, 2], cell[2], first[2], shifts[s, 2], knot, wz)
-        if count == 4:  # as usual: the compiler makes one instruction of the innermost loop
-            for i in range(4):
-                for j in range(len(wy)):
-                    w = weights[p] * wx[i] * wy[j]
-                    row = field[x + i, y + j, z : z + 4]
-                    for k in range(4):
-                        row[k] += w * wz[k]
-            continue
         for i in range(count):
             for j in range(len(wy)):
                 w = weights[p] * wx[i] * wy[j]
@@ -484,6 +480,71 @@ def _lonely_weights(positions, shifts, cell, first, knot, flat, field, weights):
                     total += w * wz[k]
         wanted = LONELY_COLOUR * total
         weights[p] = weights[p] * (wanted / colour - 1.0) if colour < wanted else 0.0
+
+
+@inlined
+def _cell_weights(coordinate, inverse_cell, first, shift):
+    """First node along an axis that a spline with knots a cell apart reaches; its four weights."""
+    place = coordinate * inverse_cell - first
+    node = np.floor(place)
+    one, third = np.float32(1.0), np.float32(1.0 / 3.0)
+    b = np.float32(place - node)
+    a, half = one - b, np.float32(0.5)
+    weights = (
+        half * third * a * a * a,
+        np.float32(2.0) * third - b * b * (one - half * b),
+        np.float32(2.0) * third - a * a * (one - half * a),
+        half * third * b * b * b,
+    )
+    return np.intp(node) - 1 + shift, weights
+
+
+@bare_kernel
+def _splat_by_cells(positions, shifts, inverse_cell, first, weights, field):
+    """`_splat` in three dimensions where the knots are a cell apart, in half the time."""
+    ny, nz = field.shape[1], field.shape[2]
+    colours = field.reshape(field.size)
+    for p in range(positions.shape[0]):
+        weight = weights[p]
+        if weight == 0.0:
+            continue
+        s = p if shifts.shape[0] > 1 else 0
+        x, wx = _cell_weights(positions[p, 0], inverse_cell[0], first[0], shifts[s, 0])
+        y, wy = _cell_weights(positions[p, 1], inverse_cell[1], first[1], shifts[s, 1])
+        z, wz = _cell_weights(positions[p, 2], inverse_cell[2], first[2], shifts[s, 2])
+        corner = (x * ny + y) * nz + z
+        for i in range(4):
+            for j in range(4):
+                w, k = weight * wx[i] * wy[j], corner + (i * ny + j) * nz
+                colours[k] += w * wz[0]
+                colours[k + 1] += w * wz[1]
+                colours[k + 2] += w * wz[2]
+                colours[k + 3] += w * wz[3]
+
+
+@bare_kernel
+def _lonely_weights_by_cells(positions, shifts, inverse_cell, first, field, weights):
+    """`_lonely_weights` in three dimensions where the knots are a cell apart."""
+    ny, nz = field.shape[1], field.shape[2]
+    colours = field.reshape(field.size)
+    for p in range(positions.shape[0]):
+        s = p if shifts.shape[0] > 1 else 0
+        x, wx = _cell_weights(positions[p, 0], inverse_cell[0], first[0], shifts[s, 0])
+        y, wy = _cell_weights(positions[p, 1], inverse_cell[1], first[1], shifts[s, 1])
+        z, wz = _cell_weights(positions[p, 2], inverse_cell[2], first[2], shifts[s, 2])
+        corner = (x * ny + y) * nz + z
+        if colours[corner + (2 * ny + 2) * nz + 2] >= INSIDE_COLOUR:
+            weights[p] = 0.0
+            continue
+        colour = np.float32(0.0)
+        for i in range(4):
+            for j in range(4):
+                k = corner + (i * ny + j) * nz
+                row = wz[0] * colours[k] + wz[1] * colours[k + 1]
+                row += wz[2] * colours[k + 2] + wz[3] * colours[k + 3]
+                colour += wx[i] * wy[j] * row
+        lacking = np.float32(LONELY_COLOUR)  # the weights' sum is 1
+        weights[p] = weights[p] * (lacking / colour - 1.0) if colour < lacking else 0.0
 
 
 @device

@@ -20,7 +20,6 @@ import atexit
 import os
 import sys
 import threading
-from contextlib import contextmanager
 
 import llvmlite.binding as ll
 import numba
@@ -47,9 +46,8 @@ from sph_ros.core.atomics import (
 from sph_ros.core.jit import callback, called, compiler, kernel
 
 # Where the words are that threads share. TICKET: see `_ticket`. DONE: parts that are finished. JOB:
-# what `call_gufunc` is to be told. ASLEEP: 1 while the caller sleeps. BESIDE: threads that take a
-# helper's place.
-CALLER, TICKET, DONE, JOB, ASLEEP, BESIDE, HELPERS, ENDING, BELL = range(0, 9 * LINE, LINE)
+# what `call_gufunc` is to be told. ASLEEP: 1 while the caller sleeps. BELL: its semaphore.
+CALLER, TICKET, DONE, JOB, ASLEEP, HELPERS, ENDING, BELL = range(0, 8 * LINE, LINE)
 
 #: Of each helper: 1 while it sleeps, its `own_thread`, and behind these its semaphore.
 FIRST_HELPER, APART = 16 * LINE, 2 * LINE
@@ -153,7 +151,7 @@ def _share_out(function, arguments, dimensions, steps, data, count, threads):
     """Do a loop of dimensions[0] parts together with the helpers, or alone where they are busy."""
     parts = read_address(dimensions)
     write_address(dimensions, 1)  # of this many parts each call is to be
-    threads = min(threads, look(HELPERS) - look(BESIDE) + 1)
+    threads = min(threads, look(HELPERS) + 1)
     if parts < 2 or parts > LOW or threads < 2 or not swap(CALLER, 0, 1):
         for part in range(parts):
             _call(function, arguments, dimensions, steps, data, count, part)
@@ -208,35 +206,18 @@ def _thread_number():
     return 0
 
 
-@contextmanager
-def beside():
-    """The calling thread takes a helper's place: that one rests while this runs.
-
-    For work that goes on for milliseconds beside a thread with parallel kernels. One thread more
-    than there are processors would have to be displaced again and again, in the middle of a part
-    that the others then wait for.
-    """
-    increase(1)
-    try:
-        yield
-    finally:
-        increase(-1)
-
-
-@kernel
-def increase(difference):
-    """Change how many threads take a helper's place."""
-    add(BESIDE, difference)
-
-
 def _start():
     """Have helpers, one for each thread that numba may use beside the caller."""
-    helpers = min(numba.config.NUMBA_NUM_THREADS - 1, MOST_HELPERS)
-    numba.get_num_threads()  # numba's layer must be there before its symbol can be replaced
+    numba.get_num_threads()  # numba's layer must be there before its symbols can be replaced
     make_semaphore(BELL)
-    for k in range(helpers):
+    helpers = 0
+    for k in range(min(numba.config.NUMBA_NUM_THREADS - 1, MOST_HELPERS)):
         make_semaphore(FIRST_HELPER + k * APART + LINE)
-        threading.Thread(target=_help, args=(k,), name=f"helper {k}", daemon=True).start()
+        try:
+            threading.Thread(target=_help, args=(k,), name=f"helper {k}", daemon=True).start()
+        except RuntimeError:  # the system allows no more threads
+            break
+        helpers = k + 1
     words[HELPERS] = helpers
     ll.add_symbol("numba_parallel_for", _layer.address)
     ll.add_symbol("get_thread_id", _thread_number.address)
@@ -247,11 +228,11 @@ def _start():
 def _end():
     """Send the helpers home: they must not run on while the process is taken apart."""
     words[HELPERS], words[ENDING] = 0, 1
-    ring_all()
+    _ring_all()
 
 
 @kernel
-def ring_all():
+def _ring_all():
     """Wake all helpers that sleep."""
     for k in range(MOST_HELPERS):
         helper = FIRST_HELPER + k * APART

@@ -4,8 +4,6 @@
 import threading
 import time
 
-from sph_ros.core.team import beside
-
 
 class SurfaceWorker:
     """Works on one job at a time; a job that waits is replaced by a newer one.
@@ -60,5 +58,4 @@ class SurfaceWorker:
                 if self._stopping:
                     return
                 job, self._job = self._job, None
-            with beside():
-                self.work(job)
+            self.work(job)
