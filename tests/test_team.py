@@ -148,6 +148,24 @@ def test_a_process_ends_while_its_helpers_wait_or_sleep():
         )
 
 
+def test_more_threads_than_processors_and_parts_than_threads():
+    told = run(
+        """
+        import numba, numpy as np
+        from test_team import count_visits, sums, words
+        from sph_ros.core import team
+        for size in (0, 3):
+            numba.set_parallel_chunksize(size)
+            visits = np.zeros(333, np.int64)
+            count_visits(visits, 300)
+            print(words[team.HELPERS], (visits == 300).all(), *sums(300, 50))
+            numba.set_num_threads(3)
+        """,
+        NUMBA_NUM_THREADS="8",
+    )
+    assert told.splitlines() == 2 * [f"7 True {300 * 1225} {300 * 40425}"]
+
+
 def test_a_layer_of_numba_is_kept_when_it_is_asked_for():
     told = run(
         """

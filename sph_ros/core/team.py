@@ -67,6 +67,9 @@ CALLER_PAUSES, CALLER_TURNS = 100, 160
 HELPER_PAUSES, HELPER_TURNS = 150, 750
 
 
+_helpers = []
+
+
 @called
 def _ticket(threads, parts):
     """A job before its first part is taken: how many may do it, its parts, how many are taken."""
@@ -155,6 +158,7 @@ def _share_out(function, arguments, dimensions, steps, data, count, threads):
     if parts < 2 or parts > LOW or threads < 2 or not swap(CALLER, 0, 1):
         for part in range(parts):
             _call(function, arguments, dimensions, steps, data, count, part)
+        write_address(dimensions, parts)
         return
     write(JOB, function)
     write(JOB + 1, arguments)
@@ -164,6 +168,7 @@ def _share_out(function, arguments, dimensions, steps, data, count, threads):
     write(JOB + 5, count)
     _open_job(threads, parts)
     _finish_job(parts)
+    write_address(dimensions, parts)
     write(CALLER, 0)
 
 
@@ -209,40 +214,45 @@ def _thread_number():
 def _start():
     """Have helpers, one for each thread that numba may use beside the caller."""
     numba.get_num_threads()  # numba's layer must be there before its symbols can be replaced
+    for function, arguments in ((_help, (types.int64,)), (_send_home, ())):
+        function.compile(arguments)  # not by a helper, nor at the end, which would wait for numba
     make_semaphore(BELL)
-    helpers = 0
     for k in range(min(numba.config.NUMBA_NUM_THREADS - 1, MOST_HELPERS)):
         make_semaphore(FIRST_HELPER + k * APART + LINE)
+        helper = threading.Thread(target=_help, args=(k,), name=f"helper {k}", daemon=True)
         try:
-            threading.Thread(target=_help, args=(k,), name=f"helper {k}", daemon=True).start()
+            helper.start()
         except RuntimeError:  # the system allows no more threads
             break
-        helpers = k + 1
-    words[HELPERS] = helpers
+        _helpers.append(helper)
+    words[HELPERS] = len(_helpers)
     ll.add_symbol("numba_parallel_for", _layer.address)
     ll.add_symbol("get_thread_id", _thread_number.address)
     atexit.register(_end)
     os.register_at_fork(after_in_child=_forget)
 
 
-def _end():
-    """Send the helpers home: they must not run on while the process is taken apart."""
-    words[HELPERS], words[ENDING] = 0, 1
-    _ring_all()
-
-
 @kernel
-def _ring_all():
-    """Wake all helpers that sleep."""
-    for k in range(MOST_HELPERS):
+def _send_home():
+    """Let all helpers end."""
+    write(ENDING, 1)
+    for k in range(look(HELPERS)):
         helper = FIRST_HELPER + k * APART
         if look(helper) == 1 and swap(helper, 1, 0):
             wake(helper + LINE)
 
 
+def _end():
+    """Helpers must not run on while the process is taken apart."""
+    _send_home()
+    for helper in _helpers:
+        helper.join(1.0)
+
+
 def _forget():
     """A forked process has no helpers; its kernels run on the calling thread."""
     words[:] = 0
+    _helpers.clear()
 
 
 if (
