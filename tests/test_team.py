@@ -6,21 +6,13 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 from pathlib import Path
 
 import numba
 import numpy as np
-import pytest
 from numba import prange
 
-from sph_ros.core import team
-from sph_ros.core.atomics import words
 from sph_ros.core.team import parallel_kernel
-
-needs_helpers = pytest.mark.skipif(
-    words[team.HELPERS] == 0, reason="no helpers: one processor, no Linux, or a layer of numba's"
-)
 
 
 @parallel_kernel
@@ -55,9 +47,10 @@ def sums(rounds, count):
 
 def run(code, **environment):
     """Standard output of a Python process."""
+    inherited = {k: v for k, v in os.environ.items() if k != "NUMBA_THREADING_LAYER"}
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environment},
+        env={**inherited, "PYTHONPATH": str(Path(__file__).parent), **environment},
         capture_output=True,
         text=True,
         check=True,
@@ -94,19 +87,30 @@ def test_loops_of_several_threads_at_once_are_all_done():
         np.testing.assert_array_equal(table, 4000)
 
 
-@needs_helpers
 def test_helpers_that_have_gone_to_sleep_come_back():
-    for _ in range(20):
-        deadline = time.monotonic() + 10.0
-        while words[team.FIRST_HELPER] == 0:
-            assert time.monotonic() < deadline, "a helper without work does not go to sleep"
-            time.sleep(0.001)
+    # In a process with a helper, however many processors there are.
+    told = run(
+        """
+        import time
+        import numpy as np
+        from test_team import count_visits
+        from sph_ros.core.atomics import words
+        from sph_ros.core import team
+        def waited_for(state, meanwhile):
+            deadline = time.monotonic() + 10.0
+            while words[team.FIRST_HELPER] != state and time.monotonic() < deadline:
+                meanwhile()
+            return words[team.FIRST_HELPER] == state
         visits = np.zeros(100, np.int64)
-        deadline = time.monotonic() + 10.0
-        while words[team.FIRST_HELPER] == 1:
-            assert time.monotonic() < deadline, "nobody wakes it"
-            count_visits(visits, 10)
-        assert np.unique(visits).size == 1
+        count_visits(visits, 10)
+        for _ in range(20):
+            assert waited_for(1, lambda: time.sleep(0.001)), "without work it does not sleep"
+            assert waited_for(0, lambda: count_visits(visits, 10)), "nobody wakes it"
+        print(words[team.HELPERS], np.unique(visits).size)
+        """,
+        NUMBA_NUM_THREADS="2",
+    )
+    assert told.split() == ["1", "1"]
 
 
 def test_one_thread_and_a_forked_process_do_all_alone():
@@ -121,7 +125,8 @@ def test_one_thread_and_a_forked_process_do_all_alone():
     told = run(
         """
         import os, numpy as np
-        from test_team import count_visits, words
+        from test_team import count_visits
+        from sph_ros.core.atomics import words
         from sph_ros.core import team
         visits = np.zeros(333, np.int64)
         count_visits(visits, 100)
@@ -131,7 +136,8 @@ def test_one_thread_and_a_forked_process_do_all_alone():
             good = (visits == 200).all() and words[team.HELPERS] == 0
             os._exit(0 if good else 1)
         print(os.waitpid(child, 0)[1])
-        """
+        """,
+        NUMBA_NUM_THREADS="2",
     )
     assert told.split() == ["0"]
 
@@ -152,7 +158,8 @@ def test_more_threads_than_processors_and_parts_than_threads():
     told = run(
         """
         import numba, numpy as np
-        from test_team import count_visits, sums, words
+        from test_team import count_visits, sums
+        from sph_ros.core.atomics import words
         from sph_ros.core import team
         for size in (0, 3):
             numba.set_parallel_chunksize(size)
@@ -170,7 +177,8 @@ def test_a_layer_of_numba_is_kept_when_it_is_asked_for():
     told = run(
         """
         import numpy as np
-        from test_team import count_visits, words
+        from test_team import count_visits
+        from sph_ros.core.atomics import words
         from sph_ros.core import team
         visits = np.zeros(333, np.int64)
         count_visits(visits, 100)
