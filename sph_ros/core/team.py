@@ -109,14 +109,13 @@ def _do_part(part):
 
 
 @called
-def _rest(turns, pauses):
-    """Wait a little, as somebody who has done so for some turns already; counts them."""
-    if turns < pauses:
+def _rest(shortly):
+    """Wait a little, keeping the processor or offering it to others."""
+    if shortly:
         for _ in range(PAUSES):
             pause()
     else:
         give_way()
-    return turns + 1
 
 
 @called
@@ -133,14 +132,16 @@ def _open_job(threads, parts):
 @called
 def _finish_job(parts):
     """Do all that nobody has taken, and wait for what others have."""
-    part = _take_part(0)
+    caller = types.int64(0)
+    part = _take_part(caller)
     while part >= 0:
         _do_part(part)
-        part = _take_part(0)
+        part = _take_part(caller)
     turns = 0
     while look(DONE) < parts:
         if turns < CALLER_TURNS:
-            turns = _rest(turns, CALLER_PAUSES)
+            _rest(turns < CALLER_PAUSES)
+            turns += 1
             continue
         write(ASLEEP, 1)
         # Who finishes the last part from now on wakes us up, perhaps before we sleep.
@@ -184,7 +185,8 @@ def _help(k):
             if _do_part(part) and look(ASLEEP) == 1 and swap(ASLEEP, 1, 0):
                 wake(BELL)
         elif turns < HELPER_TURNS:
-            turns = _rest(turns, HELPER_PAUSES)
+            _rest(turns < HELPER_PAUSES)
+            turns += 1
         else:
             turns = 0
             write(helper, 1)
