@@ -26,6 +26,7 @@ from msg_adapters.point_cloud import cdr_to_particle_cloud
 from msg_adapters.pose import pose_to_cdr
 from msg_adapters.wrench import cdr_to_wrench
 from sph_ros.core.surface import extract_surface
+from sph_ros.nodes.drivers import ThreadDriver
 from sph_ros.nodes.poses import OLDER_POSES_OF_A_RESTART, PoseGate, PoseRefusedError
 from sph_ros.nodes.publications import Publications, SurfaceJob
 from sph_ros.nodes.runner import Runner
@@ -36,6 +37,20 @@ from sph_ros.sim.simulation import Simulation
 NODE = "sph_ros.nodes.fluid_node"
 RATE = 50.0
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+#: Some drops, and a ball far above them.
+FALLING = {
+    "solver": "none",
+    "spacing": 0.02,
+    "time_step": 0.003,
+    "liquid": [{"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}}],
+}
+BALL = {
+    "name": "ball",
+    "sphere": {"radius": 0.025},
+    "pose": {"position": [0, 0, 1]},
+    "control": "topic",
+}
 
 SCENE = """
 spacing: 0.02
@@ -598,6 +613,31 @@ def test_poses_in_other_frames_go_through_tf():
     assert gate.admit(pose_to_cdr((0.5, 0, 0), UPRIGHT, 0, "/hand")).position == position
     with pytest.raises(PoseRefusedError, match="no frame moon"):
         gate.admit(pose_to_cdr((0.5, 0, 0), UPRIGHT, 0, "moon"))
+
+
+def test_a_solid_is_never_there_before_the_next_pose_comes(monkeypatch):
+    """Poses of an even motion come unevenly; who is there early stops, and pushes anew."""
+    now, rng = [0.0], np.random.default_rng(5)
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    runner = Runner(load_scene({**FALLING, "solids": [BALL]}), {})
+    driver = ThreadDriver(runner, WallSchedule(1.0, 0.1), None, None, None)
+    driver.smoothing_time = 0.1
+    gate, ball, step = PoseGate("ball", "world"), runner.sim.solid("ball"), runner.sim.time_step
+    arrivals = np.arange(200) / 60.0 + rng.uniform(-0.004, 0.004, 200)
+    speeds, behind = [], []
+    for arrival in arrivals:
+        while now[0] + step < arrival:
+            driver.step_once()
+            now[0] += step
+            speeds.append(ball.velocity[0])
+            behind.append(0.3 * now[0] - ball.position[0])
+        before, now[0] = now[0], arrival
+        driver.order(gate.admit(pose_to_cdr((0.3 * arrival, 0, 1), UPRIGHT, 0, "world")))
+        now[0] = before
+    settled = len(speeds) // 4
+    assert min(speeds[settled:]) > 0.1
+    assert np.mean(speeds[settled:]) == pytest.approx(0.3, rel=0.02)
+    assert max(behind[settled:]) < 0.3 * 0.05  # all the same it is not 50 ms late
 
 
 def test_a_slow_machine_forgets_what_it_could_not_do(monkeypatch):

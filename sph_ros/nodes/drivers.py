@@ -258,8 +258,11 @@ class ThreadDriver:
         while self._orders:
             _, order = self._orders.popitem()
             self._felt = min(self._felt, order.arrival)
-            # The solid needs as long as the hand did, in simulated time.
-            self._runner.move(order, min(order.interval * self._pace, self.smoothing_time))
+            # The solid needs as long as the hand will until its next pose, in simulated time, and a
+            # step for a pose that comes after the start of one. Who is there earlier stands still
+            # until then, and the liquid is pushed again and again.
+            duration = order.interval * self._pace + self._runner.sim.time_step
+            self._runner.move(order, min(duration, self.smoothing_time))
 
     def _measure_pace(self):
         """Simulated per real time, over some tenths of a second."""

@@ -24,6 +24,9 @@ SHORTEST_QUATERNION = 1.0e-6
 #: Pauses between poses longer than this [s] say nothing about their rate.
 LONGEST_INTERVAL = 0.5
 
+#: A pose may be late by so many mean deviations of the time between poses before it is missed.
+LATE = 2.0
+
 
 class PoseRefusedError(ValueError):
     """A pose is not used.
@@ -44,7 +47,7 @@ class Order(NamedTuple):
         solid: its name.
         position: [m], (3,).
         quat_xyzw: unit length, (4,).
-        interval: usual time between poses [s], real time; 0 when unknown.
+        interval: within this time the next pose usually comes [s], real time; 0 when unknown.
         arrival: when it came, by the monotonic clock [s].
     """
 
@@ -73,7 +76,7 @@ class PoseGate:
         self._frame = frame
         self._transform = transform
         self._arrival = None
-        self._interval = 0.0
+        self._interval, self._deviation = 0.0, 0.0
         self.forget_time()
 
     def forget_time(self):
@@ -102,7 +105,8 @@ class PoseGate:
             raise
         self.accepted += 1
         self._note_arrival()
-        return Order(self.solid, position, quat_xyzw, self._interval, self._arrival)
+        interval = self._interval + LATE * self._deviation
+        return Order(self.solid, position, quat_xyzw, interval, self._arrival)
 
     def _read(self, buffer):
         try:
@@ -153,16 +157,18 @@ class PoseGate:
         raise PoseRefusedError("stale", f"its stamp is {behind:.3f} s older than the last one's")
 
     def _note_arrival(self):
-        """Keep a running mean of the time between poses."""
+        """Keep running means of the time between poses, and of how far it is from its mean."""
         now = time.monotonic()
         if self._arrival is not None:
             interval = now - self._arrival
             if interval > LONGEST_INTERVAL:
-                self._interval = 0.0
+                self._interval, self._deviation = 0.0, 0.0
             elif self._interval == 0.0:
                 self._interval = interval
             else:
-                self._interval += 0.2 * (interval - self._interval)
+                error = interval - self._interval
+                self._deviation += 0.2 * (abs(error) - self._deviation)
+                self._interval += 0.2 * error
         self._arrival = now
 
 
