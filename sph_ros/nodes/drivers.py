@@ -2,7 +2,7 @@
 """Who steps the simulation, and when: a thread of its own, or every pose message (lockstep).
 
 Only the driver touches the simulation, so there is no lock that callbacks could wait for. Everybody
-else hands in orders (`order`) and functions (`call`), which run between two steps.
+else hands in functions (`call`), which run between two steps.
 """
 
 import math
@@ -118,13 +118,14 @@ class ThreadDriver:
     Args:
         runner: a Runner.
         schedule: a WallSchedule or ClockSchedule.
+        take_orders: gives the Orders that have come, one of each solid at most.
         publish: called in the thread with (stamp_ns, whether a surface is due).
         report: called with a line of text when a step fails.
         restarted: called when the clock jumped back and the simulation was reset.
     """
 
-    def __init__(self, runner, schedule, publish, report, restarted):
-        self._runner, self._schedule = runner, schedule
+    def __init__(self, runner, schedule, take_orders, publish, report, restarted):
+        self._runner, self._schedule, self._take_orders = runner, schedule, take_orders
         self._publish, self._report, self._restarted = publish, report, restarted
         self.paused = False
         self.publish_period, self.surface_period = 1.0 / 30.0, 1.0 / 15.0
@@ -150,14 +151,6 @@ class ThreadDriver:
         while self._calls:
             self._calls.popleft()[1].cancel()
 
-    def order(self, order):
-        """A pose message came; None when it was refused. Applied before the next step.
-
-        Only the newest of each solid waits, however long there is no step.
-        """
-        if order is not None:
-            self._orders[order.solid] = order
-
     def take_latency(self):
         """Longest time from a pose to the publication that showed it since the last call [s].
 
@@ -175,13 +168,15 @@ class ThreadDriver:
 
     def step_once(self):
         """One time step while paused; returns whether it went well."""
+        self._collect_orders()
         self._apply_orders()
         return self._step()
 
     def reset(self):
         """Back to the start."""
         self._runner.reset()
-        self._orders.clear()
+        self._collect_orders()
+        self._orders.clear()  # what came before counts no more
         self._schedule.restart(0.0)
         self._changed = True
 
@@ -212,6 +207,7 @@ class ThreadDriver:
     def _turn(self):
         """Do what is due; returns how long there is nothing to do [s]."""
         self._run_calls()
+        self._collect_orders()
         if self.paused or self._runner.fault:
             self._schedule.restart(self._runner.sim.time)
             self._pace_mark = None
@@ -253,6 +249,10 @@ class ThreadDriver:
         if not went_well:
             self._report(self._runner.fault)
         return went_well
+
+    def _collect_orders(self):
+        """Only the newest of each solid waits, however long there is no step."""
+        self._orders.update((order.solid, order) for order in self._take_orders())
 
     def _apply_orders(self):
         while self._orders:

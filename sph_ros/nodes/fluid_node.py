@@ -13,13 +13,9 @@ import sys
 from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -31,10 +27,9 @@ from sph_ros.nodes.diagnostics import (
     pose_status,
 )
 from sph_ros.nodes.drivers import LockstepDriver, ThreadDriver
-from sph_ros.nodes.frames import make_transform
 from sph_ros.nodes.help_texts import help_text
 from sph_ros.nodes.parameters import MATERIAL_PREFIX, ParameterError, Settings, declare_all
-from sph_ros.nodes.poses import PoseGate, PoseRefusedError
+from sph_ros.nodes.pose_inbox import PoseInbox
 from sph_ros.nodes.publications import Publications
 from sph_ros.nodes.runner import Runner
 from sph_ros.nodes.running import run_node
@@ -47,9 +42,6 @@ from sph_ros.waiting import tell_while_waiting, warm_up, words
 
 #: Warnings of one kind are at least so far apart [s].
 WARNING_PERIOD = 5.0
-
-#: Newer poses replace older ones that nobody had time for; in lockstep every one counts.
-POSE_DEPTH, LOCKSTEP_POSE_DEPTH = 10, 1000
 
 
 class FluidNode(Node):
@@ -82,11 +74,10 @@ class FluidNode(Node):
             warm_up(self._runner.sim)
         self._publications = Publications(self, self._runner)
         self._surfaces = SurfaceWorker(self._publications.surface, self._warn_of_surface)
-        self._driver = self._make_driver()
+        self._inbox, self._driver = self._make_driver()
         self._apply_settings()
         self._settings.follow(self._apply_settings, self._prepare_scene)
-        self._poses = {}
-        self._gates = self._subscribe()
+        self._inbox.open(scene)
         self._create_services()
         self._create_diagnostics()
         self._introduce()
@@ -117,58 +108,23 @@ class FluidNode(Node):
             self.get_logger().warning(note)
 
     def _make_driver(self):
+        """A PoseInbox and the driver for what comes in."""
         if self._step_mode == "lockstep":
-            return LockstepDriver(self._runner, self._publish, self._log_fault)
+            driver = LockstepDriver(self._runner, self._publish, self._log_fault)
+            return PoseInbox(self, driver.order), driver
         catch_up = self._settings["max_catch_up"]
         if self._step_mode == "clock":
             clock = self.get_clock()
             schedule = ClockSchedule(lambda: clock.now().nanoseconds, catch_up)
         else:
             schedule = WallSchedule(self._settings["speed"], catch_up)
-        self._schedule = schedule
-        return ThreadDriver(
-            self._runner, schedule, self._publish, self._log_fault, self._clock_jumped
-        )
-
-    def _subscribe(self):
-        transform = make_transform(self, self._runner.sim.scene.frame)
-        gates = []
-        for solid in self._runner.sim.scene.solids:
-            if solid.control == "topic":
-                gate = PoseGate(solid.name, self._runner.sim.scene.frame, transform)
-                gates.append(gate)
-                # Reliable loses nothing, not even what is sent while both sides still discover each
-                # other; best effort hears every publisher, reliable ones too.
-                options = QoSOverridingOptions.with_default_policies()
-                self._hear(gate, self._step_mode == "lockstep", options)
-        return gates
-
-    def _hear(self, gate, reliable, options):
-        """Subscribe to the poses of a solid; a reliable subscription gives way when it must."""
-        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        depth = LOCKSTEP_POSE_DEPTH if self._step_mode == "lockstep" else POSE_DEPTH
-
-        def give_way(_event):
-            if self._poses.get(gate.solid) is subscription:
-                self.destroy_subscription(subscription)
-                self._hear(gate, reliable=False, options=None)
-
-        events = SubscriptionEventCallbacks(use_default_callbacks=False)
-        if reliable:
-            # Not in the event's own callback: it belongs to what is destroyed.
-            events.incompatible_qos = lambda event: self.executor.create_task(give_way, event)
-        subscription = self._poses[gate.solid] = self.create_subscription(
-            PoseStamped,
-            f"~/solids/{gate.solid}/pose",
-            lambda buffer: self._on_pose(gate, buffer),
-            QoSProfile(depth=depth, reliability=policy),
-            event_callbacks=events,
-            qos_overriding_options=options,
-            raw=True,
+        self._schedule, inbox = schedule, PoseInbox(self)
+        return inbox, ThreadDriver(
+            self._runner, schedule, inbox.take, self._publish, self._log_fault, self._clock_jumped
         )
 
     def _create_services(self):
-        # A group of its own: services wait for the end of a step, poses must not wait with them.
+        # A group of its own: services wait for the end of a step, others must not wait with them.
         group = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/reset", self._on_reset, callback_group=group)
         self.create_service(Trigger, "~/step", self._on_step, callback_group=group)
@@ -226,29 +182,17 @@ class FluidNode(Node):
             self._runner.replace(sim)
             self._publications.follow_scene()
             self._publications.forget_solids()
+            self._inbox.close()
             self._driver.reset()
 
         self._driver.call(swap).result()
-        while self._poses:
-            self.destroy_subscription(self._poses.popitem()[1])
-        self._gates = self._subscribe()
+        self._inbox.open(sim.scene)
         self._settings.set_material(sim.scene.material, keep=names)
         material = self._settings.material()
         self._driver.call(lambda: sim.set_material(**material))
         self._introduce()
 
-    # ---------------------------------------------------------------- poses, publications
-
-    def _on_pose(self, gate, buffer):
-        try:
-            order = gate.admit(buffer)
-        except PoseRefusedError as error:
-            order = None
-            self.get_logger().warning(
-                f"{gate.solid}: pose refused ({error.reason}): {error}",
-                throttle_duration_sec=WARNING_PERIOD,
-            )
-        self._driver.order(order)
+    # ---------------------------------------------------------------- publications
 
     def _publish(self, stamp_ns, surface_due):
         """Called by the driver."""
@@ -277,8 +221,7 @@ class FluidNode(Node):
 
     def _clock_jumped(self):
         self.get_logger().info("the clock jumped back: starting over")
-        for gate in self._gates:
-            gate.forget_time()
+        self._inbox.forget_time()
 
     # ---------------------------------------------------------------- services
 
@@ -298,8 +241,7 @@ class FluidNode(Node):
 
     async def _on_reset(self, _request, response):
         await self._ask(self._driver.reset)
-        for gate in self._gates:
-            gate.forget_time()
+        self._inbox.forget_time()
         response.success, response.message = True, "back at the start"
         return response
 
@@ -342,7 +284,7 @@ class FluidNode(Node):
         facts = self._facts(factor, step_time)
         name, scene = self.get_name(), self._runner.sim.scene
         statuses = [fluid_status(name, scene, facts)]
-        for gate in self._gates:
+        for gate in self._inbox.gates:
             before = self._refused_before.get(gate.solid, 0)
             statuses.append(pose_status(name, gate, before))
             self._refused_before[gate.solid] = sum(gate.refused.values())
@@ -375,7 +317,7 @@ class FluidNode(Node):
             "max_compression": statistics["max_compression"],
             "max_speed": statistics["max_speed"],
             "pose_latency_ms": 1e3 * driver.take_latency(),
-            **{f"pose_age_{gate.solid}": gate.age for gate in self._gates},
+            **{f"pose_age_{gate.solid}": gate.age for gate in self._inbox.gates},
         }
 
     def _wanted_factor(self):

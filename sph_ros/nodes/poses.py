@@ -89,8 +89,12 @@ class PoseGate:
         """Real time since the last pose that was used [s]; NaN before the first."""
         return math.nan if self._arrival is None else time.monotonic() - self._arrival
 
-    def admit(self, buffer):
-        """The `Order` of a geometry_msgs/PoseStamped in CDR bytes.
+    def admit(self, buffer, arrival):
+        """The `Order` of a pose that came.
+
+        Args:
+            buffer: geometry_msgs/PoseStamped in CDR bytes.
+            arrival: when it came, by the monotonic clock [s].
 
         Raises:
             PoseRefusedError: it cannot be used; it is counted.
@@ -104,9 +108,9 @@ class PoseGate:
             self.refused[error.reason] += 1
             raise
         self.accepted += 1
-        self._note_arrival()
+        self._note_arrival(arrival)
         interval = self._interval + LATE * self._deviation
-        return Order(self.solid, position, quat_xyzw, interval, self._arrival)
+        return Order(self.solid, position, quat_xyzw, interval, arrival)
 
     def _read(self, buffer):
         try:
@@ -156,11 +160,10 @@ class PoseGate:
         behind = (self._last_ns - stamp_ns) / NANOSECONDS
         raise PoseRefusedError("stale", f"its stamp is {behind:.3f} s older than the last one's")
 
-    def _note_arrival(self):
+    def _note_arrival(self, arrival):
         """Keep running means of the time between poses, and of how far it is from its mean."""
-        now = time.monotonic()
         if self._arrival is not None:
-            interval = now - self._arrival
+            interval = arrival - self._arrival
             if interval > LONGEST_INTERVAL:
                 self._interval, self._deviation = 0.0, 0.0
             elif self._interval == 0.0:
@@ -169,7 +172,7 @@ class PoseGate:
                 error = interval - self._interval
                 self._deviation += 0.2 * (abs(error) - self._deviation)
                 self._interval += 0.2 * error
-        self._arrival = now
+        self._arrival = arrival
 
 
 def _unit(quat_xyzw):
