@@ -21,9 +21,6 @@ LINE = 8
 #: How many words there are.
 WORDS = 512 * LINE
 
-#: Words that a `sem_t` takes, and more.
-SEMAPHORE = LINE
-
 SYMBOL = "sph_ros_shared_words"
 
 _WORD = ir.IntType(64)
@@ -44,7 +41,7 @@ _PAUSES = {
 
 
 def make_semaphore(index):
-    """Make words[index : index + SEMAPHORE] a semaphore that nobody has posted."""
+    """Make the `LINE` words from an index on a semaphore (`sem_t`) that nobody has posted."""
     if ctypes.CDLL(None).sem_init(ctypes.c_void_p(_ADDRESS + 8 * index), 0, 0) != 0:
         raise OSError("no semaphore could be made")
 

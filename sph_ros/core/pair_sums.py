@@ -98,11 +98,10 @@ def expect(entries, k, far):
 @inlined
 def expect_all(pairs, k, far):
     """The same of neighbours and gradients."""
-    if far:
-        prefetch(pairs.neighbors, k + AHEAD)
-        prefetch(pairs.x, k + AHEAD)
-        prefetch(pairs.y, k + AHEAD)
-        prefetch(pairs.z, k + AHEAD)
+    expect(pairs.neighbors, k, far)
+    expect(pairs.x, k, far)
+    expect(pairs.y, k, far)
+    expect(pairs.z, k, far)
 
 
 @inlined
