@@ -58,6 +58,7 @@ def measure(spacing, solver, seconds):
         simulation.step()
         steps += 1
     wall, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # The same once more, to the bit, with a look at each step.
     simulation.reset()
     for _ in range(WARM_UP):
@@ -70,7 +71,6 @@ def measure(spacing, solver, seconds):
         compression.append(facts["mean_compression"])
         iterations += facts["iterations"]
     count = simulation.particle_count
-    memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "solver": solver,
         "particles": count,

@@ -240,8 +240,11 @@ class FluidNode(Node):
         return outcome.result()
 
     async def _on_reset(self, _request, response):
-        await self._ask(self._driver.reset)
-        self._inbox.forget_time()
+        def reset():
+            self._driver.reset()
+            self._inbox.forget_time()
+
+        await self._ask(reset)
         response.success, response.message = True, "back at the start"
         return response
 

@@ -67,7 +67,7 @@ class PoseInbox:
             self._node.destroy_subscription(self._subscriptions.popitem()[1])
 
     def forget_time(self):
-        """Take poses whatever their stamps: the clock jumped."""
+        """Take poses whatever their stamps: time started over. For one thread at a time."""
         for gate in self.gates:
             gate.forget_time()
 

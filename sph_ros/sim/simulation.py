@@ -204,6 +204,7 @@ class Simulation:
     def reset(self):
         """Back to time zero: the scene's liquid, the scene's poses; the present material stays."""
         self._solids.reset()
+        self._fluid = self._solver = self._guard = None  # their memory is needed now
         self._start()
 
     def save(self, path):
