@@ -421,6 +421,30 @@ def test_realtime_pause_step_reset(realtime):
     realtime.ros.wait_for(lambda: 0 < newest_stamp(realtime) < 10e9)
 
 
+def test_realtime_takes_the_good_pose_among_bad_ones_and_counts_these(realtime):
+    goal, before = np.array([0.05, 0.06, 0.07]), realtime.report()[3]
+    realtime.send(goal, 100.0)
+    for bad in BAD_POSES.values():
+        realtime.send_bytes(bad)
+    more = lambda ball, key: int(ball[key]) - int(before[key])  # noqa: E731
+    counts = realtime.report(lambda _, ball: more(ball, "poses_refused") == len(BAD_POSES))[3]
+    assert all(more(counts, f"refused_{reason}") == 1 for reason in BAD_POSES)
+    ball = lambda: cdr_to_markers(realtime.solids[-1])[1].position  # noqa: E731
+    realtime.ros.wait_for(lambda: np.allclose(ball(), goal, atol=1e-6), what="for the ball")
+    assert "pose refused" in realtime.program.output
+    # Those that wait when it starts over are of the time before; later ones may have any stamp.
+    assert realtime.pause(True).success
+    realtime.send((0.07, 0.06, 0.09), 101.0)
+    taken = lambda _, ball: more(ball, "poses_accepted") == 2  # noqa: E731
+    realtime.report(taken)
+    assert realtime.trigger("reset").success and realtime.pause(False).success
+    restarted = lambda: 0 < cdr_to_markers(realtime.solids[-1])[1].stamp_ns < 10e9  # noqa: E731
+    realtime.ros.wait_for(restarted, what="for a step after the start")
+    assert np.allclose(ball(), [0.06, 0.06, 0.16], atol=1e-6)
+    realtime.send(goal, 1.0)
+    realtime.ros.wait_for(lambda: np.allclose(ball(), goal, atol=1e-6), what="for the ball")
+
+
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_best_effort_publishers_are_heard(mode, request):
     client = request.getfixturevalue(mode)
