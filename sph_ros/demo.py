@@ -106,7 +106,9 @@ def _hand(scene, bag):
         topic = reader.only_topic(POSE_STAMPED).name
     read_poses(path, topic)  # whatever is wrong with them is said before anything starts
     target = f"/fluid/solids/{controlled[0]}/pose"
-    return [str(path), "--loop", "--topics", topic, "--remap", f"{topic}:={target}"]
+    # Recorded stamps jump back with each lap, which the node takes for stragglers at first.
+    again = ["--loop", "--stamp", "now"]
+    return [str(path), *again, "--topics", topic, "--remap", f"{topic}:={target}"]
 
 
 # ---------------------------------------------------------------- live

@@ -11,9 +11,10 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
-from msg_adapters.bags import BagWriter, open_bag
+from msg_adapters.bags import BagWriter, open_bag, read_poses
 from msg_adapters.header import NANOSECONDS
 from msg_adapters.point_cloud import cdr_to_particle_cloud
 from msg_adapters.pose import POSE_STAMPED, pose_to_cdr
@@ -97,6 +98,23 @@ def test_headless_leaves_a_video_a_picture_and_a_bag(scene, tmp_path):
     again = start_demo(tmp_path, "--headless", "--scene", scene, "--out", out)
     assert again.wait(30.0) == 1
     assert "holds a demo already" in (tmp_path / "log.txt").read_text()
+
+
+def test_the_laps_of_a_recorded_hand_are_one_course(scene, tmp_path):
+    """Stamps that jump back would have the node refuse the first poses of each lap."""
+    with BagWriter(tmp_path / "short") as bag:
+        for number in range(20):
+            stamp = 50 * NANOSECONDS + number * NANOSECONDS // 50
+            pose = pose_to_cdr((0.1, 0.1, 0.2), (0.0, 0.0, 0.0, 1.0), stamp, "world")
+            bag.write("/hand", POSE_STAMPED, stamp, pose)
+    out = tmp_path / "out"
+    demo = start_demo(
+        tmp_path, "--headless", "--scene", scene, "--bag", tmp_path / "short", "--seconds", "1.5",
+        "--out", out,
+    )  # fmt: skip
+    assert demo.wait(120.0) == 0, (tmp_path / "log.txt").read_text()
+    stamps = read_poses(out / "bag", "/fluid/solids/ball/pose").stamps_ns
+    assert len(stamps) > 40 and all(np.diff(stamps) > 0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
