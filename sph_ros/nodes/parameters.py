@@ -91,8 +91,8 @@ class Settings:
             0.05,
             0.0,
             1.0,
-            "a solid reaches a new pose after the time between poses, but after so long at most "
-            "[s]; 0: within one time step",
+            "a solid reaches a new pose when the next one may be expected, late ones included, but "
+            "after so long at most [s]; 0: within one time step",
         )
         for field, (low, high) in RANGES.items():
             text = MATERIAL_TEXTS.get(field, field.replace("_", " "))
